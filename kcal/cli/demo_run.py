@@ -236,7 +236,7 @@ def real_pairs(
         run("calibrate", output / f"{side}.obs.json", "-o", camera, "--picture", picture)
     cameras, seen = ([output / f"{side}.{kind}.json" for side in SIDES] for kind in ("camera", "obs"))
     # Few pairs: none is left out, so that each board can be compared.
-    run("rig", *cameras, "--pairs", *seen, "--no-reject", "-o", output / "rig.json")
+    run("rig", *cameras, "--pairs", *seen, "--keep-all", "-o", output / "rig.json")
 
     write_marks(output / "points.csv", _board_ends(output, board))
     where = origin or Origin(lat=0.0, lon=0.0, height=0.0)

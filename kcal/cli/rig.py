@@ -44,7 +44,7 @@ def solve_command(
     require: kinds.Needs | None = None,
     report: Path | None = None,
     intrinsics: Rare[Literal["prior", "fixed", "free"]] = "prior",
-    reject: Rare[bool] = True,
+    keep_all: Rare[bool] = False,
     board_warp: Rare[bool] = False,
     picture: Rare[kinds.Picture | None] = None,
 ) -> None:
@@ -94,7 +94,7 @@ def solve_command(
         report: HTML page to write: may it be used, and why not.
         intrinsics: Refine the cameras within what their calibrations know, hold them as if they were exact, or let
             them free.
-        reject: Leave out what contradicts the rest, and name it; otherwise only warn.
+        keep_all: Leave nothing out; only warn.
         board_warp: Also estimate how the board bends.
         picture: a plan, and residuals.
     """
@@ -114,7 +114,7 @@ def solve_command(
     if not sources.given:
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = RigOptions(
-        intrinsics=intrinsics, board_warp=board_warp, reject=reject, refraction=sources.refraction.value,
+        intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=sources.refraction.value,
         refraction_sigma=sources.refraction_sigma,
     )  # fmt: skip
     if others:

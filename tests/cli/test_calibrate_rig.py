@@ -264,7 +264,7 @@ class TestRig:
         for pixel in content["views"][4]["pixels"]:
             pixel[1] += shift
         (cameras / "right.obs.json").write_text(json.dumps(content))
-        arguments = f"rig left.camera.json right.camera.json {PAIRS}{' --no-reject' if keep_all else ''}"
+        arguments = f"rig left.camera.json right.camera.json {PAIRS}{' --keep-all' if keep_all else ''}"
         printed = command(arguments, "-o plain.json")
         drawn = command(arguments, "-o drawn.json --picture rig.png")
         assert drawn.err == printed.err

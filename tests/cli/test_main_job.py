@@ -107,7 +107,7 @@ class TestRealImages:
         assert [file.calibration.rms < 0.17 for file in files if file.calibration] == [True, True]
         code, text, error = run(
             *("rig", "left.camera.json", "right.camera.json", "--pairs", "left.obs.json", "right.obs.json"),
-            *("-o", "r.json", "--no-reject"),
+            *("-o", "r.json", "--keep-all"),
         )
         assert code == 0
         # One pair of this capture is three times as far off as the others; at most one more is named.

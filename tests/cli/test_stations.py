@@ -314,7 +314,7 @@ def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: 
         *boards,
         "--baseline",
         f"mill:church={far:.5f}±0.00001",
-        "--no-reject",
+        "--keep-all",
         "-o",
         "rig.json",
     )
