@@ -379,22 +379,5 @@ def mark_again(
     return f"To mark in the images: {shlex.join([*words, '-o', str(marks or 'marks.csv')])}"
 
 
-def option_for_each(words: Sequence[str], option: str) -> str:
-    """The command that was typed with an option once for all of the files after it, with it before each of them.
-
-    Example:
-        >>> option_for_each(["report", "rig.json", "--observations", "a.json", "b.json"], "--observations")
-        'kcal report rig.json --observations a.json --observations b.json'
-    """
-    found, follows = ["kcal"], False
-    for word in words:
-        if word.startswith("-"):
-            follows = word == option
-            found += [] if follows else [word]
-        else:
-            found += [option, word] if follows else [word]
-    return shlex.join(found)
-
-
 def _millimeters(meters: float) -> str:
     return f"{1e3 * meters:.10g}mm"

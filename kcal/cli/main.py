@@ -20,7 +20,7 @@ from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
 from kcal.cli.check import check_command
 from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
-from kcal.cli.console import err, option_for_each, print_replaced, with_json, working
+from kcal.cli.console import err, print_replaced, with_json, working
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.exchange import export_command, import_command, schema_command
@@ -52,9 +52,6 @@ def usage_errors_shown() -> Iterator[None]:
     except Exception as error:
         if format_message := getattr(error, "format_message", None):
             shown = visible(format_message())
-            if "unexpected extra argument" in shown and "--observations" in inputs.typed:
-                again = option_for_each(inputs.typed, "--observations")
-                shown = f"{shown.rstrip('.')}. --observations takes one file; give it before each: {visible(again)}"
             setattr(error, "format_message", lambda: shown)  # noqa: B010
         raise
 

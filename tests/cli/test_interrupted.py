@@ -230,19 +230,6 @@ def kcal(*words: object) -> tuple[int, str]:
     return found.exit_code, found.output
 
 
-def test_files_that_follow_one_option_are_refused_with_the_command(tmp_path: Path) -> None:
-    words = ("report", "rig.json", "--observations", "left.obs.json", "right.obs.json", "--require", "1km:5%")
-    code, text = kcal(*words)
-    assert code == 2
-    plain = " ".join(text.replace("│", " ").split())
-    assert (
-        "--observations takes one file; give it before each: kcal report rig.json --observations left.obs.json "
-        "--observations right.obs.json --require 1km:5%" in plain
-    )
-    # Another slip gets no such advice.
-    assert "give it before each" not in kcal("report", "rig.json", "other.json")[1]
-
-
 @pytest.mark.slow
 def test_a_stereo_capture_from_observations_to_the_verdict_on_its_rig(kcal_data: Path, tmp_path: Path) -> None:
     """Ten of the pairs of a webcam rig, of which nobody knows the truth: what must agree, agrees."""
