@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import inspect
 import itertools
 import os
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
-
-import typer
-from typer.models import ArgumentInfo, OptionInfo
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kcal.cli.console import err, warn
 from kcal.errors import FileError, InputError
@@ -245,30 +240,6 @@ class _Given(NamedTuple):
         return self.wanted.part if name else file_kind(path) in self.wanted.kinds or _unseen(text)
 
 
-def with_inputs(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, which refuses files that are missing, or not what is `Wanted`, before it loads anything."""
-    signature = inspect.signature(command, eval_str=True)
-    files = {}
-    for name, parameter in signature.parameters.items():
-        about = getattr(parameter.annotation, "__metadata__", ())
-        wanted = next((part for part in about if isinstance(part, Wanted)), None)
-        if wanted is not None:
-            files[name] = _parameter_label(name, about), wanted
-
-    @functools.wraps(command)
-    def run(*arguments: Any, **options: Any) -> None:
-        given = signature.bind(*arguments, **options).arguments
-        outputs = given.get("output") or []
-        check_given(
-            [(label, wanted, given.get(name)) for name, (label, wanted) in files.items()],
-            outputs if isinstance(outputs, list) else [outputs],
-        )
-        return command(*arguments, **options)
-
-    run.__signature__ = signature  # type: ignore[attr-defined]
-    return run
-
-
 def check_given(files: Sequence[tuple[str, Wanted, Any]], outputs: Sequence[Any]) -> None:
     """Refuse files that are missing, or not what is wanted, before anything is loaded.
 
@@ -363,14 +334,6 @@ def _file_texts(value: Any) -> list[str]:
     return [str(one) for one in values if one is not None]
 
 
-def _parameter_label(name: str, about: Sequence[Any]) -> str:
-    for part in about:
-        if isinstance(part, OptionInfo):
-            named = [text for text in (part.default, *(part.param_decls or ())) if str(text).startswith("--")]
-            return str(named[0]) if named else f"--{name.replace('_', '-')}"
-    return next((part.metavar for part in about if isinstance(part, ArgumentInfo) and part.metavar), name.upper())
-
-
 def _unseen(text: str) -> bool:
     """Whether a text names no file to look into: the standard input, a wildcard or a stream."""
     return text in ("-", "") or is_stream(text) or (any(c in text for c in "*?[") and not os.path.lexists(text))
@@ -380,14 +343,6 @@ def _unseen(text: str) -> bool:
 
 # Of marks on sharp images, where nobody said.
 ASSUMED = 0.3
-PixelSigma: TypeAlias = Annotated[
-    float | None,
-    typer.Option(
-        "--pixel-sigma",
-        metavar="PX",
-        help="Noise of marks along each axis; that in the rig's file, or 0.3, if not given.",
-    ),
-]
 
 
 def pixel_sigma_of(given: float | None, rig: Rig | None = None) -> float:

@@ -230,7 +230,6 @@ def _of_pairs(solved: Rig, own: LocateOptions, noise: float) -> tuple[PointLocat
     from kcal.lens.rig import RigCovariance
     from kcal.locate.points import PointLocator
     from kcal.locate.tabulate import find_geoid
-    from kcal.watch.watcher import located_at
 
     localize, geoid = pair_localizer(solved, own, noise), find_geoid(own.geoid_grid)
 
@@ -242,6 +241,9 @@ def _of_pairs(solved: Rig, own: LocateOptions, noise: float) -> tuple[PointLocat
     if solved.covariance is None:
         # Not exact: moments add what is not known of them.
         solved.covariance = RigCovariance.of(solved)
+    # Loads OpenCV and SciPy, which nothing else here needs.
+    from kcal.watch.watcher import located_at
+
     return locator(solved), located_at(own.history, solved, locator)
 
 

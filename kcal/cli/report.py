@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 Judged: TypeAlias = "tuple[Verdict, Callable[[], dict[str, bytes]], list[list[list[str]]]]"
 # The exit code of a no, apart from errors (1) and wrong usage (2).
 NO = 3
-REQUIRE_HELP = "What you need: ranges and the largest σ of each, for example 5km:10% or 800m:20m,5km:10%."
 
 
 def report_command(

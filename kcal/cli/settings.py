@@ -18,7 +18,7 @@ import typer
 from kcal import values
 from kcal.cli.console import print_wrote
 from kcal.errors import FileError, InputError
-from kcal.files import check_picture, check_writable, is_stream, read_bytes, write_atomic
+from kcal.files import check_writable, is_stream, read_bytes, write_atomic
 
 # Settings of a folder: `kcal.toml`, written by `kcal init`, gives options of the commands that are run there or below.
 
@@ -174,26 +174,6 @@ def _toml(value: Any) -> str:
         return repr(float(value))
     escaped = value.replace("\\", "\\\\").replace('"', '\\"')
     return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'
-
-
-# Commands with short help, and defaults from the `kcal.toml` of the folder.
-
-
-def rarely(metavar: str, about: str, *flags: str, panel: str | None = None, **more: Any) -> Any:
-    """An option that few people need: `--help-all` shows it."""
-    return typer.Option(*flags, metavar=metavar or None, help=about, hidden=True, rich_help_panel=panel, **more)
-
-
-def picture_option(about: str, *flags: str, hidden: bool = False) -> Any:
-    """An option for a picture to write; a name that no picture can have is refused before anything is computed."""
-
-    def checked(path: Path | None) -> Path | None:
-        if path is not None:
-            check_picture(path)
-        return path
-
-    about = f"Picture to write (.png, .svg or .pdf): {about}"
-    return typer.Option(*flags, metavar="FILE", help=about, hidden=hidden, callback=checked)
 
 
 # `kcal init`: a kcal.toml for a folder, so that the commands that are run there are short.

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 # Night images as commands read them: when and where they were taken, and the lens that their stars tell.
 
-TIME_HELP = "When, with its zone: 2026-11-24T20:47:26Z; name:Z or name:+02:00 reads it from each file's name."
-
 
 def sky_view(
     path: Path,
