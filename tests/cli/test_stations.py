@@ -176,7 +176,7 @@ def test_exchanged_columns_of_a_survey(
         places = enumerate(enu_to_geodetic(points, origin).tolist())
         lines = [",".join(map(str, (f"p{i}", *change(i, *place), 0.05))) for i, place in places]
         (tmp_path / "survey.csv").write_text("\n".join(["name,lat,lon,height,sigma", *lines]) + "\n")
-        given = [str(tmp_path / name) for name in ("cctv.camera.json", "survey.csv")]
+        given = [str(tmp_path / "cctv.camera.json"), "--landmarks", str(tmp_path / "survey.csv")]
         more = ["--marks", str(tmp_path / "marks.csv"), "-o", str(tmp_path / "rig.json")]
         return CliRunner().invoke(app, ["station", *given, *more])
 
