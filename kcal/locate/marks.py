@@ -128,10 +128,9 @@ class Marks(NamedTuple):
         return torch.where(self.pixels.isfinite().all(-1), found, math.nan)
 
     def typical_sigma(self, sigma: float) -> float:
-        """The root mean square of `sigmas`, px; marks that are missing do not count. Without any: `sigma`."""
-        found = self.sigmas(sigma)
-        known = found[found.isfinite()]
-        return float(known.square().mean().sqrt()) if len(known) else sigma
+        """The median of `sigmas`, px, so that one vague mark does not count for all; `sigma` without any mark."""
+        found = self.sigmas(sigma).nanmedian()
+        return float(found) if found.isfinite() else sigma
 
     def __repr__(self) -> str:
         return brief(self)

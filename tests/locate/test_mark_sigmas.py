@@ -33,8 +33,12 @@ def test_a_mark_has_the_mean_variance_of_its_axes() -> None:
     assert marks(None).sigmas(0.3).tolist()[0] == pytest.approx([0.3, 0.3])
 
 
-def test_the_typical_sigma_is_of_the_marks_that_are_there() -> None:
-    assert marks(stated()).typical_sigma(0.3) == pytest.approx(math.sqrt((0.08 + 0.05**2 + 3 * 0.09) / 5))
+def test_the_typical_sigma_is_the_median_of_the_marks_that_are_there() -> None:
+    vague = torch.full((3, 4, 4), torch.nan, dtype=torch.float64)
+    vague[0] = torch.diag(torch.tensor([9.0, 9.0, 4.0, 4.0]).double())
+    assert marks(vague).typical_sigma(0.3) == 0.3
+    assert marks(stated()).typical_sigma(0.1) == pytest.approx(0.1)
+    assert marks(stated()).typical_sigma(0.01) == pytest.approx(0.01)
     nothing = Marks.of_pair(("a",), torch.tensor([NONE]), torch.tensor([NONE]), None)
     assert nothing.typical_sigma(0.3) == 0.3
 
