@@ -99,7 +99,7 @@ def live_command(
         compile: Translate the filter to C++ first, which takes minutes; for many targets.
         start: Calendar time of second 0, if times are not Unix seconds; for events.
     """
-    from kcal.locate.stations import names_of_rig
+    from kcal.io.rig_file import load_rig
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.grouping import read_moment
     from kcal.pipeline.measurements import ClockPrior
@@ -111,10 +111,11 @@ def live_command(
         raise typer.BadParameter("--site and --heading belong together")
     if (detections is None) == (not videos):
         raise typer.BadParameter("give videos and --detector, or --detections")
-    names = names_of_rig(rig)
+    known = load_rig(rig)
+    names = known.names
     if videos and (len(videos) != len(names) or detector is None):
         raise typer.BadParameter(f"{len(names)} videos, of the cameras {', '.join(names)}, and --detector are needed")
-    many = names != ("left", "right")
+    many = not known.is_pair or names != ("left", "right")
     if many and (clock_offset or {"site", "heading", "match_sigma"} & taken or options.heading is not None):
         raise typer.BadParameter("--site, --heading, --clock-offset and --match-sigma are of rigs of two cameras")
     if many and options.history is not None:
@@ -124,7 +125,7 @@ def live_command(
         check_writable(path, rig, *([lines] if lines else []), *(videos or []))
     clock = ClockPrior(offset_s=clock_offset, offset_sigma_s=clock_sigma, drift_sigma=clock_sigma / 3600.0)
     joining = AssociationOptions(box_sigma=box_sigma)
-    localize, run = _stations(rig, options.pixel_sigma) if many else _mast(rig, options)
+    localize, run = _stations(rig, known, options.pixel_sigma) if many else _mast(known, options)
     solved = localize if many else localize.rig
 
     if compile:
@@ -204,27 +205,24 @@ def summary(counts: StreamCounts) -> str:
     return "; ".join(parts)
 
 
-def _mast(rig: Path, options: LocateOptions) -> tuple[Localizer, Located]:
+def _mast(known: Rig, options: LocateOptions) -> tuple[Localizer, Located]:
     """Two cameras, and how positions of them are told."""
-    from kcal.io.rig_file import load_pair
     from kcal.locate.points import PointLocator
 
-    known = load_pair(rig)
     localize = pair_localizer(known, options, pixel_sigma_of(options.pixel_sigma, known))(known)
     return localize, PointLocator(localize).located()
 
 
-def _stations(rig: Path, pixel_sigma: float | None) -> tuple[Localizer, Located]:
+def _stations(path: Path, rig: Rig, pixel_sigma: float | None) -> tuple[Localizer, Located]:
     """Many cameras, and how positions of them are told."""
-    from kcal.io.rig_file import load_rig
     from kcal.locate.localizer import Localizer
     from kcal.locate.points import PointLocator
     from kcal.locate.stations import stations_of
 
-    known = stations_of(load_rig(rig))
+    known = stations_of(rig)
     if known.origin is None:
         raise InputError(
-            f"{rig}: this rig has no place on the Earth; solve it with landmarks or positions with latitudes"
+            f"{path}: this rig has no place on the Earth; solve it with landmarks or positions with latitudes"
         )
     localize = Localizer(known, weights="all", pixel_sigma=pixel_sigma_of(pixel_sigma, known))
     return localize, PointLocator(localize).located()

@@ -205,11 +205,10 @@ def _judged_again(
 def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], pixel_sigma: float | None) -> Judged:
     from kcal.corners.observations import Observations
     from kcal.io.rig_file import load_rig
-    from kcal.locate.stations import names_of_rig
     from kcal.report.judge_rig import named_cameras
 
-    pair = names_of_rig(path) == ("left", "right")
     rig = load_rig(path)
+    pair = rig.is_pair and rig.names == ("left", "right")
     mark_sigma = pixel_sigma_of(pixel_sigma, rig)
     cameras = named_cameras(rig)
     if pair and observations and len(observations) != 2:

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from kcal.errors import FileError, InputError
-from kcal.files import read_bytes
 from kcal.lens.camera import Camera
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting, Origin, Rig, half_of_covariance
 from kcal.locate.geodesy import ecef_from_enu_rotation, enu_from_cam, geodetic_to_enu
@@ -18,15 +17,6 @@ from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import attitude, station_mounting
 from kcal.locate.survey import EARTH, place_sigma
 from kcal.locate.tables import TableRow, read_rows
-from kcal.strict_json import MOST_BYTES, read_json
-
-
-def names_of_rig(path: str | Path) -> tuple[str, ...]:
-    """Names of the cameras of a rig file, without reading more than that; left and right of a file of two."""
-    path = Path(path)
-    content = read_json(read_bytes(path, MOST_BYTES), str(path))
-    names = content.get("names") if isinstance(content, dict) else None
-    return tuple(map(str, names)) if isinstance(names, list) else ("left", "right")
 
 
 def stations_of(rig: Rig) -> Rig:

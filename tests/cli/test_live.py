@@ -226,3 +226,26 @@ def test_stations_into_files(tmp_path: Path) -> None:
     assert 180.0 < float(rows[-1]["azimuth_deg"]) < 360.0
     refused = CliRunner().invoke(app, [*command, *outputs, "--heading", "3", "--site", "1,2,3"])
     assert refused.exit_code == 2
+
+
+def test_placed_cameras_may_be_named_left_and_right(tmp_path: Path) -> None:
+    """Each has its own pose with errors, which is not a pair in the left one's frame."""
+    rig = ring(2, 6000.0)
+    rig.names, rig.root = ("left", "right"), rig.with_errors(position_m=0.3, attitude_deg=0.004)
+    save_rig(rig, tmp_path / "towers.json")
+    pixels = marks(rig, torch.tensor([[300.0, 200.0, 150.0]]).double())
+    boxes = torch.cat([pixels - 5.5, pixels + 6.5], -1)
+    lines = [
+        json.dumps(
+            {"cameras": {n: {"time": 1.7e9 + s, "boxes": boxes[:, c].tolist()} for c, n in enumerate(rig.names)}}
+        )
+        for s in range(8)
+    ]
+    (tmp_path / "lines.jsonl").write_text("\n".join(lines), encoding="utf-8")
+    command = ["live", str(tmp_path / "towers.json"), "--detections", str(tmp_path / "lines.jsonl")]
+    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "tracks.csv")], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    with open(tmp_path / "tracks.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert rows
+    assert float(rows[-1]["east_m"]) == pytest.approx(300.0, abs=15.0)
