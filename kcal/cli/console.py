@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import gc
-import inspect
 import re
 import shlex
 import signal
@@ -13,10 +11,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import orjson
-import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
@@ -88,37 +84,6 @@ def _tell_more(name: str, *items: Any) -> None:
     _told.setdefault(name, []).extend(items)
 
 
-def with_json(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with an option `--json`: one JSON object on the standard output, in place of what it prints.
-
-    The object has `exit_code`, what the command tells (`tell`), `wrote`, `tables`, `warnings`, and the lines that a
-    person would read as `text`. Errors go to the error stream, and the exit code is the same, with it and without.
-    """
-
-    @functools.wraps(command)
-    def run(*arguments: Any, as_json: bool = False, **options: Any) -> None:
-        _told.clear()
-        if not as_json:
-            return command(*arguments, **options)
-        code = 0
-        with out.capture() as captured:
-            try:
-                command(*arguments, **options)
-            except typer.Exit as stopped:
-                code = stopped.exit_code
-        end_line()
-        print(orjson.dumps({"exit_code": code, **_told, "text": captured.get().splitlines()}).decode())
-        raise typer.Exit(code)
-
-    option = Annotated[bool, typer.Option("--json", help="Print one JSON object for programs in place of text.")]
-    own = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
-    signature = inspect.signature(command, eval_str=True)
-    parameters = [*signature.parameters.values(), own]
-    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return run
-
-
 def warn(text: str) -> None:
     """Print a warning to the error stream."""
     _tell_more("warnings", visible(text))
@@ -169,13 +134,17 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
     """
     rows = [[one_line(cell) for cell in row] for row in rows]
     _tell_more("tables", rows)
+    out.print("\n".join(aligned(rows, left)), markup=False)
+
+
+def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
+    """A line for each row, in columns that are as wide as they need to be; see `print_table`."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:
         cells = zip(row, widths, strict=True)
-        aligned = [cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(cells)]
-        lines.append("  ".join(aligned).rstrip())
-    out.print("\n".join(lines), markup=False)
+        lines.append("  ".join(cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(cells)))
+    return [line.rstrip() for line in lines]
 
 
 def tell_table(name: str, table: Table, left: Collection[int] = (0,)) -> None:

@@ -10,20 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from kcal.cli import kinds
-from kcal.cli.console import (
-    end_line,
-    err,
-    json_asked,
-    mark_again,
-    out,
-    print_table,
-    print_wrote,
-    steps,
-    tell,
-    warn,
-    with_command,
-)  # fmt: skip
+from kcal.cli import console, kinds
+from kcal.cli.console import err, json_asked, out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_and_source
 from kcal.cli.options import Kind, Rare
 from kcal.cli.settings import settings_file, taken
@@ -361,7 +349,7 @@ def locate_command(
     if streamed and (json_asked() or outputs.count(STREAM) > 1):
         raise typer.BadParameter("-o - takes the standard output for itself; leave out --json and a second -o -")
     if streamed:
-        end_line()
+        console.end_line()
     for path in outputs:
         if path == STREAM:
             check_format(f"positions{suffix}")
@@ -422,4 +410,4 @@ def locate_command(
     if "ok" not in sample.statuses:
         rows = "pairs" if located.feet is None else "points"
         text = f"{points}: none of the {sample.count} {rows} could be located; see the table"
-        raise DegenerateError(with_command(text, mark_again(None, None, rig=rig)))
+        raise DegenerateError(console.with_command(text, console.mark_again(None, None, rig=rig)))

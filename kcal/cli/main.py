@@ -20,10 +20,11 @@ from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
 from kcal.cli.check import check_command
 from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
-from kcal.cli.console import err, print_replaced, with_json, working
+from kcal.cli.console import err, print_replaced, working
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.exchange import export_command, import_command, schema_command
+from kcal.cli.init import init_command
 from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
@@ -32,7 +33,7 @@ from kcal.cli.place import place_command
 from kcal.cli.rectify import rays_command, rectify_command
 from kcal.cli.report import report_command
 from kcal.cli.rig import app as rig
-from kcal.cli.settings import defaults_of, init_command, read_settings
+from kcal.cli.settings import defaults_of, read_settings
 from kcal.cli.show import show_command
 from kcal.cli.sites import budget_command, sites_command
 from kcal.cli.stars import stars_command
@@ -116,7 +117,7 @@ def _global_options(
 
 
 app.command("demo", cls=Command)(declared(demo_command))
-app.command("init", cls=Command)(with_json(init_command))
+app.command("init", cls=Command)(declared(init_command))
 app.add_typer(board, name="board")
 app.command("capture", cls=Command)(declared(capture_command, json=False))
 app.command("detect", cls=Command)(declared(detect_command))

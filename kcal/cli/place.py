@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import typer
 
 from kcal.cli import kinds
-from kcal.cli.console import err, out, print_table, print_wrote, tell
+from kcal.cli.console import err, out, print_wrote
 from kcal.cli.options import Several
-from kcal.cli.stations import camera_names, station_rows, told_stands
+from kcal.cli.stations import camera_names, print_stands
 from kcal.errors import InputError
 from kcal.files import check_writable
 from kcal.values import WithSigma
@@ -67,8 +67,7 @@ def place_command(
     paths = cameras * len(stands) if len(cameras) == 1 else cameras
     rig = station_rig({name: lenses[path] for name, path in zip(stands, paths, strict=True)}, [*stands.values()])
     save_rig(rig, output)
-    tell(cameras=told_stands(rig))
-    print_table(station_rows(rig))
+    print_stands(rig)
     print_wrote(output)
     out.print(
         f"next: kcal locate {output} marks.csv, with lines of name,camera,u,v; --height or --terrain where one camera "

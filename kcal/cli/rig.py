@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import itertools
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import typer
 
-import kcal.cli.console as console
-import kcal.cli.inputs as inputs
-import kcal.cli.rig_sources as rig_sources
 from kcal.cli import kinds
 from kcal.cli.console import err, out, print_table, print_wrote, warn
-from kcal.cli.inputs import pixel_sigma_of
+from kcal.cli.inputs import pixel_sigma_and_source, pixel_sigma_of
 from kcal.cli.options import Command, Rare, declared, group_with_default
-from kcal.cli.report import NO, judged_sides, side_pictures, stored_tables, told_usable, warned_of
 from kcal.cli.rig_options import Sources
-from kcal.cli.stations import print_rig, rig_lines, solve_stations
+from kcal.cli.stations import solve
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 
@@ -99,98 +93,16 @@ def solve_command(
         picture: a plan, and residuals.
     """
     from kcal.calibrate.rig.solve import RigOptions
-    from kcal.corners.observations import Observations
-    from kcal.io.rig_file import save_rig
-    from kcal.locate.budget import range_sigmas
-    from kcal.locate.mirrored import solve_surveyed
-    from kcal.locate.mounting import placed_rig
-    from kcal.report.tables import range_sigma_rows
 
-    needs, pairs = require or (), sources.pairs
-    inputs.pixel_sigma_and_source(sources.pixel_sigma)
-    for path in (output, report):
-        if path is not None:
-            check_writable(path, left, right, *sources.files)
+    pixel_sigma_and_source(sources.pixel_sigma)
     if not sources.given:
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = RigOptions(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=sources.refraction.value,
         refraction_sigma=sources.refraction_sigma,
     )  # fmt: skip
-    if others:
-        solve_stations([left, right, *others], sources, options, output, needs=needs, report=report, picture=picture)
-        return
-    calibrated = rig_sources.load_cameras((left, right))
-    rig_sources.check_sides(calibrated, (left, right))
-
-    def cure(error: object) -> str:
-        if pairs and sources.landmarks is None and isinstance(error, InputError):
-            return console.look_at_views(Observations.load(pairs[0]), pairs[0])
-        return console.mark_again(sources.landmarks, sources.marks, cameras=(left, right))
-
-    with console.ending_with(cure):
-        read = rig_sources.read_sources(calibrated, sources, rig_sources.place_names((left, right)))
-        frame = read.origin
-        with console.steps("solving the rig", None) as advance:
-            result = solve_surveyed(read.data, frame, options, advance)
-    rig = result.stereo() if frame is None else placed_rig(result, frame)
-    known = read.pixel_sigma if sources.pixel_sigma is None else sources.pixel_sigma
-    if rig.calibration is not None and known is not None:
-        rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=known)
-    noise, note = inputs.pixel_sigma_and_source(sources.pixel_sigma, rig)
-    # Everything that can fail comes before the file.
-    lines = rig_lines(result, rig, read.unpaired)
-    console.tell(
-        rms_px=result.rms,
-        baseline_m=float(rig.baseline),
-        baseline_sigma_m=result.sigma_baseline,
-        pairs=list(result.pairs),
-        left_out={item.label: item.reason for item in result.left_out},
-        warnings=list(result.warnings),
-    )
-    print_rig(result, [*lines, *read.told(result)])
-    save_rig(rig, output)
-    if picture is not None:
-        from kcal.report.figures import save_picture
-        from kcal.report.rig import rig_figure
-
-        save_picture(picture, rig_figure(result))
-    try:
-        console.print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
-        if note:
-            console.out.print(note)
-    except InputError as error:
-        console.warn(f"range errors are not split: {error}")
-    console.print_wrote(output, picture)
-    if needs or report is not None:
-        from kcal.report.judge_rig import named_cameras, rig_verdict
-        from kcal.report.verdict_pictures import rig_pictures
-
-        sides = tuple(pairs) if pairs and _calibrated_from(rig, pairs) else ()
-        cameras = judged_sides(named_cameras(rig), sides, noise)
-        verdict = rig_verdict(
-            rig, needs, mark_sigma=noise, result=result, cameras=[found[0] for found in cameras],
-            subject=output.name.split(".")[0],
-        )  # fmt: skip
-        tables = stored_tables(rig)
-        console.tell(verdict=verdict.to_dict())
-
-        def drawn() -> dict[str, bytes]:
-            return {**rig_pictures(result), **side_pictures(cameras)}
-
-        if not told_usable(verdict, drawn, tables, report, warned=warned_of(result)):
-            raise typer.Exit(NO)
-
-
-def _calibrated_from(rig: Rig, pairs: Sequence[Path]) -> bool:
-    """Whether these are the views from which both cameras were calibrated, as far as their names tell."""
-    from kcal.corners.observations import Observations
-
-    records = [camera.calibration.record if camera.calibration else None for camera in (rig.left, rig.right)]
-    return all(
-        record is not None and set(record.per_view_rms) <= set(Observations.load(file).names)
-        for record, file in zip(records, pairs, strict=True)
-    )
+    paths = [left, right, *(others or [])]
+    solve(paths, sources, options, output, needs=require or (), report=report, picture=picture)
 
 
 app.command("solve", hidden=True, cls=Command)(declared(solve_command))
@@ -246,7 +158,7 @@ def check(
     if reference is not None and landmarks is not None:
         raise InputError("give --reference or --landmarks, not both: with old marks no survey is needed")
     if relock is not None:
-        check_writable(relock, marks, *(path for path in (reference, landmarks) if path is not None))
+        check_writable(relock, marks, *filter(None, (reference, landmarks)))
     old = load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, old)
     now = read_marks(marks, single=True)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from kcal.cli.console import err, steps, warn
+from kcal.cli.console import aligned, err, steps, warn
 from kcal.cli.inputs import typed_with
 from kcal.cli.rig_options import Sources
 from kcal.cli.stars import images_by_camera, read_stars
@@ -122,8 +122,7 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
         (one.name, *map(str, (one.matched, one.untextured, one.off_line, one.moved, one.thinned, one.used)))
         for one in counts
     ]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    read.notes += ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
+    read.notes += aligned(rows)
     alone = len(named[0]) + len(named[1]) - 2 * len(chosen)
     if alone:
         read.notes.append(f"{alone} images of the scene without partner")

@@ -15,7 +15,7 @@ import pydantic
 
 from kcal.cli.console import out, print_table
 from kcal.cli.inputs import SHOWN
-from kcal.cli.stations import station_rows
+from kcal.cli.stations import print_stands
 from kcal.errors import FileError
 from kcal.file_kind import file_kind
 from kcal.files import read_bytes
@@ -212,7 +212,7 @@ def _show_stations(file: Path) -> None:
     for camera in rig.each:
         _show_camera(*_derived_camera(camera))
     out.print("")
-    print_table(station_rows(rig))
+    print_stands(rig)
     out.print("error bars of cameras and poses together" if rig.root is not None else "no error bars of the poses")
     if (solved := rig.calibration) is not None:
         out.print(f"solved {solved.created:%Y-%m-%d %H:%M %Z}: RMS {solved.rms:.4f} px", markup=False)

@@ -1,4 +1,4 @@
-"""Rigs of any number of cameras: what is printed of them, and how three and more, or one alone, are solved."""
+"""Rigs of any number of cameras: how they are solved, and what is printed of them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import kcal.cli.rig_sources as rig_sources
-from kcal.cli import kinds
-from kcal.cli.console import err, out, print_table, print_wrote, steps, tell
+from kcal.cli import console, kinds
+from kcal.cli.console import aligned, err, out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.inputs import pixel_sigma_and_source
 from kcal.cli.options import Only
-from kcal.cli.report import NO, stored_tables, told_usable, warned_of
+from kcal.cli.report import NO, judged_sides, side_pictures, stored_tables, told_usable, warned_of
 from kcal.cli.rig_options import Sources
 from kcal.errors import InputError
 from kcal.files import check_writable
@@ -44,8 +45,7 @@ def source_lines(result: RigResult) -> list[str]:
         ]
         sigmas = "" if source.sigmas is None else f"{source.sigmas:.2f}"
         rows.append([source.name, f"{source.used}", f"{source.left_out}", *cells, sigmas])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
+    return aligned(rows)
 
 
 def rig_lines(result: RigResult, rig: Rig, unpaired: int) -> list[str]:
@@ -121,7 +121,7 @@ def print_rig(result: RigResult, lines: list[str]) -> None:
         err.print("[yellow]warning:[/]", text)
 
 
-# Rigs of three and more cameras, and one alone, for `kcal rig`, `kcal station` and `kcal locate`.
+# How rigs of any number of cameras are solved, for `kcal rig` and `kcal station`.
 
 
 def camera_names(paths: Sequence[Path]) -> tuple[str, ...]:
@@ -137,7 +137,28 @@ def camera_names(paths: Sequence[Path]) -> tuple[str, ...]:
     return names
 
 
-def solve_stations(
+def _check_sources(sources: Sources) -> None:
+    """Refuse what only rigs of two cameras are solved from."""
+    for given, option, instead in (
+        (sources.match, "--match", "views belong together by their names"),
+        (sources.scene, "--scene", "give matches as a table by --features"),
+    ):
+        if given is not None:
+            raise InputError(f"{option} is for rigs of two cameras; {instead}")
+
+
+def _cure(paths: Sequence[Path], sources: Sources, error: object) -> str:
+    """The command after a refusal of what a rig of two cameras was to be solved from."""
+    from kcal.corners.observations import Observations
+
+    if len(paths) != 2:
+        return ""
+    if sources.pairs and sources.landmarks is None and isinstance(error, InputError):
+        return console.look_at_views(Observations.load(sources.pairs[0]), sources.pairs[0])
+    return console.mark_again(sources.landmarks, sources.marks, cameras=(paths[0], paths[1]))
+
+
+def solve(
     paths: Sequence[Path],
     sources: Sources,
     options: RigOptions,
@@ -147,106 +168,139 @@ def solve_stations(
     report: Path | None = None,
     picture: Path | None = None,
 ) -> None:
-    """Solve one camera, or three and more, write the rig, print how each stands and whether it may be used."""
+    """Solve a rig of two cameras, one camera, or three and more.
+
+    The rig is written; it is printed how each camera stands, and whether the rig may be used.
+    """
     from kcal.io.rig_file import save_rig
     from kcal.locate.mirrored import solve_surveyed
+    from kcal.locate.mounting import placed_rig
 
-    names = camera_names(paths)
-    for given, option, instead in (
-        (sources.match, "--match", "views belong together by their names"),
-        (sources.scene, "--scene", "give matches as a table by --features"),
-    ):
-        if given is not None:
-            raise InputError(f"{option} is for rigs of two cameras; {instead}")
-    check_writable(output, *paths, *sources.files)
-    read = rig_sources.read_sources(rig_sources.load_cameras(paths), sources, names)
-    with steps("solving the stations", None) as advance:
-        result = solve_surveyed(read.data, read.origin, options, advance)
-    rig = result.stations(read.origin)
-    assert rig.calibration is not None
-    rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=sources.marks_sigma)
-    tell(
-        rms_px=result.rms, cameras=told_stands(rig), warnings=list(result.warnings),
-        undetermined=list(result.undetermined), left_out={item.label: item.reason for item in result.left_out},
-    )  # fmt: skip
+    two = len(paths) == 2
+    names = rig_sources.place_names(paths) if two else camera_names(paths)
+    if not two:
+        _check_sources(sources)
+    for path in filter(None, (output, report)):
+        check_writable(path, *paths, *sources.files)
+    cameras = rig_sources.load_cameras(paths)
+    if two:
+        rig_sources.check_sides(cameras, paths)
+    with console.ending_with(functools.partial(_cure, paths, sources)):
+        read = rig_sources.read_sources(cameras, sources, names)
+        with steps("solving the rig" if two else "solving the stations", None) as advance:
+            result = solve_surveyed(read.data, read.origin, options, advance)
+    if not two:
+        rig = result.stations(read.origin)
+    else:
+        rig = result.stereo() if read.origin is None else placed_rig(result, read.origin)
+    known = read.pixel_sigma if two and sources.pixel_sigma is None else sources.marks_sigma
+    if rig.calibration is not None and known is not None:
+        rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=known)
+    noise, note = pixel_sigma_and_source(sources.pixel_sigma, rig)
+    # Everything that can fail comes before the file.
+    lines = rig_lines(result, rig, read.unpaired) if two else source_lines(result)
+    left_out = {item.label: item.reason for item in result.left_out}
+    tell(rms_px=result.rms, warnings=list(result.warnings), left_out=left_out)
+    print_rig(result, [*lines, *read.told(result)])
     save_rig(rig, output)
     if picture is not None:
         from kcal.report.figures import save_picture
         from kcal.report.rig import rig_figure
 
         save_picture(picture, rig_figure(result))
-    _print_stations(result, rig, read.told(result))
+    if two:
+        baseline = float(rig.baseline)
+        tell(baseline_m=baseline, baseline_sigma_m=result.sigma_baseline, pairs=list(result.pairs))
+        _print_ranges(rig, noise, note)
+    else:
+        tell(undetermined=list(result.undetermined))
+        print_stands(rig)
+        if rig.root is None:
+            err.print("[yellow]warning:[/] the data leave something open, so that the rig has no error bars")
+        if rig.origin is None:
+            out.print(
+                "No latitudes were given: positions are meters of the local frame. --site anchors it on the Earth."
+            )
     print_wrote(output, picture)
     if needs or report is not None:
-        from kcal.report.judge_rig import rig_verdict
+        from kcal.report.judge_rig import named_cameras, rig_verdict
         from kcal.report.verdict_pictures import rig_pictures
 
-        subject = output.name.split(".")[0]
-        verdict = rig_verdict(rig, needs, mark_sigma=sources.marks_sigma, result=result, subject=subject)
+        pairs = sources.pairs or ()
+        sides = judged_sides(named_cameras(rig), pairs if two and _calibrated_from(rig, pairs) else (), noise)
+        verdict = rig_verdict(
+            rig, needs, mark_sigma=noise, result=result, cameras=[found[0] for found in sides],
+            subject=output.name.split(".")[0],
+        )  # fmt: skip
         tell(verdict=verdict.to_dict())
-        pictures = functools.partial(rig_pictures, result)
-        if not told_usable(verdict, pictures, stored_tables(rig), report, warned=warned_of(result)):
+
+        def drawn() -> dict[str, bytes]:
+            return {**rig_pictures(result), **side_pictures(sides)}
+
+        if not told_usable(verdict, drawn, stored_tables(rig), report, warned=warned_of(result)):
             raise typer.Exit(NO)
 
 
-def _print_stations(result: RigResult, rig: Rig, notes: Sequence[str]) -> None:
+def _print_ranges(rig: Rig, noise: float, note: str) -> None:
+    """Print what the errors of ranges consist of."""
+    from kcal.locate.budget import range_sigmas
+    from kcal.report.tables import range_sigma_rows
 
-    print_rig(result, [*source_lines(result), *notes])
-    print_table(station_rows(rig))
-    if rig.root is None:
-        err.print("[yellow]warning:[/] the data leave something open, so that the rig has no error bars")
-    if rig.origin is None:
-        out.print("No latitudes were given: positions are meters of the local frame. --site anchors it on the Earth.")
+    try:
+        print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
+        if note:
+            out.print(note)
+    except InputError as error:
+        warn(f"range errors are not split: {error}")
 
 
-def station_rows(rig: Rig) -> list[list[str]]:
-    """A table of how each camera stands, heads first, with error bars: on the Earth, or in the rig's own frame."""
+def _calibrated_from(rig: Rig, pairs: Sequence[Path]) -> bool:
+    """Whether these are the views from which both cameras were calibrated, as far as their names tell."""
+    from kcal.corners.observations import Observations
+
+    records = [camera.calibration.record if camera.calibration else None for camera in (rig.left, rig.right)]
+    return bool(pairs) and all(
+        record is not None and set(record.per_view_rms) <= set(Observations.load(file).names)
+        for record, file in zip(records, pairs, strict=True)
+    )
+
+
+def print_stands(rig: Rig) -> None:
+    """Print how each camera stands, with error bars: on the Earth, or in the rig's own frame."""
     import torch
 
     from kcal.locate.stations import station_stands
 
-    where = ["lat", "lon", "height m"] if rig.origin else ["east m", "north m", "up m"]
-    rows = [["camera", "RMS px", *where, "± level", "± up", "heading °", "pitch °", "roll °"]]
+    axes, heads, digits = ("east_m", "north_m", "up_m"), ["east m", "north m", "up m"], (3, 3, 3)
+    if rig.origin:
+        axes, heads, digits = ("lat", "lon", "height"), ["lat", "lon", "height m"], (7, 7, 2)
     # The frame of the first camera has no north.
     own = not rig.origin and torch.equal(rig.rotation[0], torch.eye(3).to(rig.rotation))
-    if own:
-        rows = [["camera", "RMS px", "x m", "y m", "z m"]]
+    heads = ["x m", "y m", "z m"] if own else [*heads, "± level", "± up", "heading °", "pitch °", "roll °"]
+    rows, told = [["camera", "RMS px", *heads]], {}
     residuals = rig.calibration.rms_px if rig.calibration else (None,) * len(rig)
     for c, (name, residual) in enumerate(zip(rig.names, residuals, strict=True)):
-        rms = "" if residual is None else f"{residual:.3f}"
         place, angles, covariance = station_stands(rig, c)
-        digits = (7, 7, 2) if rig.origin else (3, 3, 3)
-        told = [f"{value:.{many}f}" for value, many in zip(place, digits, strict=True)]
-        if own:
-            rows.append([name, rms, *told])
-            continue
-        if rig.root is None or covariance is None:
-            rows.append([name, rms, *told, "", "", *(f"{angle:.4f}" for angle in angles)])
-            continue
-        sigma = covariance.diagonal().sqrt().tolist()
-        if not rig.origin:
-            told[:2] = (number_text(value, one) for value, one in zip(place[:2], sigma[:2], strict=True))
-        level = math.degrees(max(sigma[3:5]))
-        rows.append(
-            [name, rms, *told[:2], number_text(place[2], sigma[2]), length_text(max(sigma[:2]), digits=2),
-             length_text(sigma[2], digits=2), measured_text(angles[0], math.degrees(sigma[5])),
-             measured_text(angles[1], level), number_text(angles[2], level)]
-        )  # fmt: skip
-    return rows
-
-
-def told_stands(rig: Rig) -> dict[str, dict[str, float]]:
-    """How each camera stands, for --json."""
-    from kcal.locate.stations import station_stands
-
-    told, where = {}, ("lat", "lon", "height") if rig.origin else ("east_m", "north_m", "up_m")
-    for c, name in enumerate(rig.names):
-        place, angles, covariance = station_stands(rig, c)
-        told[name] = dict(zip((*where, "heading_deg", "pitch_deg", "roll_deg"), (*place, *angles), strict=True))
+        told[name] = dict(zip((*axes, "heading_deg", "pitch_deg", "roll_deg"), (*place, *angles), strict=True))
+        where = [f"{value:.{many}f}" for value, many in zip(place, digits, strict=True)]
+        how = ["", "", *(f"{angle:.4f}" for angle in angles)]
         if rig.root is not None and covariance is not None:
             sigma = covariance.diagonal().sqrt().tolist()
             told[name] |= {"sigma_m": max(sigma[:3]), "sigma_deg": math.degrees(max(sigma[3:6]))}
-    return told
+            level = math.degrees(max(sigma[3:5]))
+            if not own:
+                where[2] = number_text(place[2], sigma[2])
+            if not own and not rig.origin:
+                where[:2] = map(number_text, place[:2], sigma[:2])
+            how = [
+                length_text(max(sigma[:2]), digits=2), length_text(sigma[2], digits=2),
+                measured_text(angles[0], math.degrees(sigma[5])), measured_text(angles[1], level),
+                number_text(angles[2], level),
+            ]  # fmt: skip
+        rms = "" if residual is None else f"{residual:.3f}"
+        rows.append([name, rms, *where, *([] if own else how)])
+    print_table(rows)
+    tell(cameras=told)
 
 
 # The sources of one camera.
@@ -282,4 +336,4 @@ def station_command(
 
     if sources.landmarks is None and sources.terrain is None:
         raise typer.BadParameter("give surveyed places and --marks, or a raster of the terrain (--terrain)")
-    solve_stations([camera], sources, RigOptions(), output)
+    solve([camera], sources, RigOptions(), output)

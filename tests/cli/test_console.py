@@ -26,8 +26,9 @@ from waiting import PATIENCE
 
 from kcal import Board, Camera, Observations, View, load_rig, save_camera
 from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
+from kcal.cli.init import toml_text
 from kcal.cli.main import app, main, usage_errors_shown
-from kcal.cli.settings import SETTINGS, defaults_of, read_settings, toml_text
+from kcal.cli.settings import SETTINGS, defaults_of, read_settings
 from kcal.errors import FileError
 from kcal.files import read_bytes, replaced, write_atomic, written_files
 from kcal.io.rig_file import save_rig
@@ -269,8 +270,8 @@ def test_what_is_not_understood_is_refused(text: str, message: str, folder: Path
 
 def test_every_setting_is_a_parameter_of_its_commands() -> None:
     group = get_command(app)
-    for setting in SETTINGS.values():
-        for words, parameter in setting.takers:
+    for parameter, setting in SETTINGS.items():
+        for words in setting.takers:
             command = group
             for word in words.split():
                 command = command.commands[word]
