@@ -14,7 +14,7 @@ from kcal.cli.console import err, out, print_table, print_wrote, warn
 from kcal.cli.inputs import pixel_sigma_and_source, pixel_sigma_of
 from kcal.cli.options import Command, Rare, declared, group_with_default
 from kcal.cli.rig_options import Sources
-from kcal.cli.stations import solve
+from kcal.cli.stations import solve_and_write
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 
@@ -102,7 +102,7 @@ def solve_command(
         refraction_sigma=sources.refraction_sigma,
     )  # fmt: skip
     paths = [left, right, *(others or [])]
-    solve(paths, sources, options, output, needs=require or (), report=report, picture=picture)
+    solve_and_write(paths, sources, options, output, needs=require or (), report=report, picture=picture)
 
 
 app.command("solve", hidden=True, cls=Command)(declared(solve_command))

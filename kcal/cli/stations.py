@@ -147,7 +147,7 @@ def _check_sources(sources: Sources) -> None:
             raise InputError(f"{option} is for rigs of two cameras; {instead}")
 
 
-def _cure(paths: Sequence[Path], sources: Sources, error: object) -> str:
+def _cure_of_sources(paths: Sequence[Path], sources: Sources, error: object) -> str:
     """The command after a refusal of what a rig of two cameras was to be solved from."""
     from kcal.corners.observations import Observations
 
@@ -158,7 +158,7 @@ def _cure(paths: Sequence[Path], sources: Sources, error: object) -> str:
     return console.mark_again(sources.landmarks, sources.marks, cameras=(paths[0], paths[1]))
 
 
-def solve(
+def solve_and_write(
     paths: Sequence[Path],
     sources: Sources,
     options: RigOptions,
@@ -185,7 +185,7 @@ def solve(
     cameras = rig_sources.load_cameras(paths)
     if two:
         rig_sources.check_sides(cameras, paths)
-    with console.ending_with(functools.partial(_cure, paths, sources)):
+    with console.ending_with(functools.partial(_cure_of_sources, paths, sources)):
         read = rig_sources.read_sources(cameras, sources, names)
         with steps("solving the rig" if two else "solving the stations", None) as advance:
             result = solve_surveyed(read.data, read.origin, options, advance)
@@ -336,4 +336,4 @@ def station_command(
 
     if sources.landmarks is None and sources.terrain is None:
         raise typer.BadParameter("give surveyed places and --marks, or a raster of the terrain (--terrain)")
-    solve([camera], sources, RigOptions(), output)
+    solve_and_write([camera], sources, RigOptions(), output)
