@@ -116,35 +116,19 @@ def _global_options(
     pass
 
 
-app.command("demo", cls=Command)(declared(demo_command))
-app.command("init", cls=Command)(declared(init_command))
+COMMANDS = (
+    demo_command, init_command, capture_command, detect_command, calibrate_command, interpolate_command,
+    compare_command, batch_command, mark_command, station_command, place_command, stars_command, locate_command,
+    live_command, watch_command, budget_command, sites_command, rectify_command, rays_command, bake_command,
+    export_command, import_command, schema_command, show_command, diff_command, check_command, report_command,
+)  # fmt: skip
+# They run on, or write where they are told.
+WITHOUT_JSON = (capture_command, mark_command, live_command, watch_command)
+for command in COMMANDS:
+    run = declared(command, json=command not in WITHOUT_JSON)
+    app.command(command.__name__.removesuffix("_command"), cls=Command)(run)
 app.add_typer(board, name="board")
-app.command("capture", cls=Command)(declared(capture_command, json=False))
-app.command("detect", cls=Command)(declared(detect_command))
-app.command("calibrate", cls=Command)(declared(calibrate_command))
-app.command("interpolate", cls=Command)(declared(interpolate_command))
-app.command("compare", cls=Command)(declared(compare_command))
-app.command("batch", cls=Command)(declared(batch_command))
-app.command("mark", cls=Command)(declared(mark_command, json=False))
 app.add_typer(rig, name="rig")
-app.command("station", cls=Command)(declared(station_command))
-app.command("place", cls=Command)(declared(place_command))
-app.command("stars", cls=Command)(declared(stars_command))
-app.command("locate", cls=Command)(declared(locate_command))
-app.command("live", cls=Command)(declared(live_command, json=False))
-app.command("watch", cls=Command)(declared(watch_command, json=False))
-app.command("budget", cls=Command)(declared(budget_command))
-app.command("sites", cls=Command)(declared(sites_command))
-app.command("rectify", cls=Command)(declared(rectify_command))
-app.command("rays", cls=Command)(declared(rays_command))
-app.command("bake", cls=Command)(declared(bake_command))
-app.command("export", cls=Command)(declared(export_command))
-app.command("import", cls=Command)(declared(import_command))
-app.command("schema", cls=Command)(declared(schema_command))
-app.command("show", cls=Command)(declared(show_command))
-app.command("diff", cls=Command)(declared(diff_command))
-app.command("check", cls=Command)(declared(check_command))
-app.command("report", cls=Command)(declared(report_command))
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ from kcal.cli.stars import print_star_budget
 from kcal.errors import InputError
 from kcal.file_kind import file_kind
 from kcal.files import check_writable, write_atomic
+from kcal.table import Table
 from kcal.texts import length_text, range_text
 from kcal.values import WithSigma
 
@@ -69,11 +70,8 @@ def sites_command(
     from kcal.locate.siting import area_of, rank_sites, read_sites, sites_of, siting_map
     from kcal.locate.stations import stations_of
 
-    inputs = [path for path in (towers, candidates, terrain) if path is not None]
-    if output is not None:
-        check_writable(output, *inputs)
-    if picture is not None:
-        check_writable(picture, *inputs)
+    for path in filter(None, (output, picture)):
+        check_writable(path, *filter(None, (towers, candidates, terrain)))
     if (terrain is None) == (ground is None):
         raise InputError("give --terrain, or --ground with the height of level ground above the ellipsoid; one of them")
     surface = level_ground(ground) if terrain is None and ground is not None else raster_of(terrain or "", geoid)
@@ -98,16 +96,13 @@ def sites_command(
     if bool(field.surface.up.isnan().any()):
         warn("the terrain has no heights in some places between sites and area: nothing is taken to be hidden by them")
     _print_towers(now)
+    table = _ranked_table(ranked)
     if ranked:
-        print_table(_ranked_rows(ranked))
+        print_table(table.cells)
+    told = zip(ranked, table.records, strict=True)
     tell(
         mean_sigma_m=now.mean_sigma, covered=now.covered,
-        candidates=[
-            dataclasses.asdict(one.site.origin)
-            | {"name": one.site.name, "heading_deg": one.site.heading_deg, "order": one.order, "covered": one.covered,
-               "mean_sigma_m": one.mean_sigma, "mean_sigma_after_m": one.after}
-            for one in ranked
-        ],
+        candidates=[dataclasses.asdict(one.site.origin) | record for one, record in told],
     )  # fmt: skip
     if later is not None:
         out.print(f"with the chosen: {length_text(later.mean_sigma, digits=3)}, {100 * later.covered:.0f} % covered")
@@ -133,17 +128,21 @@ def _print_towers(now: SitingMap) -> None:
     )
 
 
-def _ranked_rows(ranked: list[RankedSite]) -> list[list[str]]:
-
-    rows = [["candidate", "build", "heading °", "alone", "covered", "after"]]
+def _ranked_table(ranked: list[RankedSite]) -> Table:
+    columns = {
+        "name": "candidate", "order": "build", "heading_deg": "heading °", "mean_sigma_m": "alone",
+        "covered": "covered", "mean_sigma_after_m": "after",
+    }  # fmt: skip
+    rows = []
     for one in ranked:
-        heading = "" if one.site.heading_deg is None else f"{one.site.heading_deg:.0f}"
+        order, heading, after = one.order, one.site.heading_deg, one.after
         rows.append([
-            one.site.name, "" if one.order is None else str(one.order), heading,
-            length_text(one.mean_sigma, digits=3), f"{100 * one.covered:.0f} %",
-            "" if one.after is None else length_text(one.after, digits=3),
+            one.site.name, None if order is None else (order, f"{order}"),
+            None if heading is None else (heading, f"{heading:.0f}"),
+            (one.mean_sigma, length_text(one.mean_sigma, digits=3)), (one.covered, f"{100 * one.covered:.0f} %"),
+            None if after is None else (after, length_text(after, digits=3)),
         ])  # fmt: skip
-    return rows
+    return Table(columns, rows)
 
 
 def _map_text(area: Area, now: SitingMap, later: SitingMap | None) -> str:
@@ -247,10 +246,7 @@ def budget_command(
         out.print(f"\nWhat the rig file knows, and {noise:g} px of noise in each mark:")
         print_table(range_sigma_rows(range_sigmas(chosen, far, pixel_sigma=noise)))
     if aperture is not None:
-        print_star_budget(
-            float(chosen.left.params[0]), chosen.left.size, float(chosen.baseline), 5000.0, aperture, pitch,
-            clock_sigma,
-        )  # fmt: skip
+        print_star_budget(chosen, aperture, pitch, clock_sigma)
     if picture is not None:
         from kcal.report.figures import save_picture
         from kcal.report.positions import budget_figure, plotted_ranges

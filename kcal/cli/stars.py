@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from kcal.calibrate.rig.stars import StarSource
     from kcal.cli.rig_options import Sources
     from kcal.lens.camera import Camera
-    from kcal.lens.rig import Origin
+    from kcal.lens.rig import Origin, Rig
     from kcal.stars.detect import DetectedStars
     from kcal.stars.lens import StarCamera
     from kcal.stars.night import NamedStars, SkyView
@@ -80,36 +80,29 @@ def camera_by_stars(
 
 # What stars would give a planned rig, for `kcal budget --stars`.
 
+# Meters: the range whose errors are told.
+_DISTANCE = 5000.0
 # Exposures in the table, seconds, and pairs of images.
 _EXPOSURES, _PAIRS = (1 / 30, 0.25, 1.0, 4.0, 8.0), 20
 _SKIES = {"rural": 20.5, "suburb": 18.0}
 
 
-def print_star_budget(
-    focal: float,
-    size: tuple[int, int],
-    baseline: float,
-    distance: float,
-    aperture: float,
-    altitude: float,
-    clock: float,
-) -> None:
+def print_star_budget(rig: Rig, aperture: float, altitude: float, clock: float) -> None:
     """Print how many stars a lens, an exposure and a sky give, and what range error follows from them.
 
     Args:
-        focal: px.
-        size: of the image, px.
-        baseline: meters.
-        distance: meters, for which range errors are.
+        rig: its left camera is the lens.
         aperture: of the lens, mm.
         altitude: of the middle of the image, degrees.
         clock: sigma of the offset between the cameras' clocks, seconds.
     """
     from kcal.stars.detect import NightPlan, planned_stars
 
+    focal, size = float(rig.left.params[0]), rig.left.size
     out.print(
         f"stars: f {focal:g} px, {size[0]}x{size[1]}, aperture {aperture:g} mm, middle of the image {altitude:g}° up, "
-        f"clocks ± {clock:g} s; range errors at {distance:g} m from stars and clocks alone (lens and marks come on top)"
+        f"clocks ± {clock:g} s; range errors at {_DISTANCE:g} m from stars and clocks alone (lens and marks come on "
+        "top)"
     )
     rows = [["sky", "exposure s", "stars", "faintest", "σ px", "trail px", "1 pair", f"{_PAIRS} pairs"]]
     told = []
@@ -120,7 +113,7 @@ def print_star_budget(
                 altitude_deg=altitude,
             )  # fmt: skip
             found = planned_stars(plan)
-            shares = [found.range_share(distance, baseline, pairs, clock) for pairs in (1, _PAIRS)]
+            shares = [found.range_share(_DISTANCE, float(rig.baseline), pairs, clock) for pairs in (1, _PAIRS)]
             some = math.isfinite(found.yaw_sigma)
             rows.append([
                 sky, f"{seconds:.3g}", f"{found.stars:.0f}", f"{found.faintest:.1f}" if some else "",
@@ -444,7 +437,6 @@ def stars_command(
     told: list[dict[str, Any]] = []
     seen: list[tuple[str, NamedStars]] = []
     rows = [["image", "stars", "named", "RMS px", *_heads(views[0])]]
-    drawn = picture is None
     with steps("naming stars", len(files)) as advance:
         for path, view in zip(files, views, strict=True):
             try:
@@ -456,15 +448,13 @@ def stars_command(
                 told.append({"image": path.name, "identified": 0, "error": str(error)})
                 warn(f"{path.name}: {error}")
             else:
+                if picture is not None and not seen:
+                    _draw(picture, image, found, catalog, path.name)
                 told.append(_told(path, found))
                 seen.append((path.name, found))
                 rows.append(_row(path, found))
                 for text in found.warnings:
                     warn(f"{path.name}: {text}")
-                if not drawn:
-                    assert picture is not None
-                    _draw(picture, image, found, catalog, path.name)
-                    drawn = True
             advance(path.name)
     for number, text in clock_doubts([found for _, found in seen]):
         warn(f"{seen[number][0]}: {text}")
@@ -473,7 +463,8 @@ def stars_command(
     if len(rows) == 1:
         raise InputError(f"in none of {len(files)} images stars have names")
     print_table(rows)
-    _say_unknown(views[0])
+    if views[0].on_earth and dut1 is None:
+        out.print("UT1 - UTC is not known (--dut1): it is part of the σ about the Earth's axis with 8″")
     print_wrote(picture)
 
 
@@ -494,12 +485,8 @@ def _row(path: Path, found: NamedStars) -> list[str]:
 
 
 def _told(path: Path, found: NamedStars) -> dict[str, Any]:
-    angles: dict[str, Any]
-    if (on_earth := found.heading_pitch_roll) is not None:
-        angles = dict(zip(("heading_deg", "pitch_deg", "roll_deg"), on_earth, strict=True))
-    else:
-        assert found.right_ascension_declination is not None
-        angles = dict(zip(("right_ascension_deg", "declination_deg"), found.right_ascension_declination, strict=True))
+    names = ("heading_deg", "pitch_deg", "roll_deg") if found.on_earth else ("right_ascension_deg", "declination_deg")
+    angles = found.heading_pitch_roll or found.right_ascension_declination or ()
     return {
         "image": path.name,
         "time": None if found.view.time is None else found.view.time.isoformat(),
@@ -507,7 +494,7 @@ def _told(path: Path, found: NamedStars) -> dict[str, Any]:
         "identified": found.attitude.count,
         "rms_px": found.attitude.rms_px,
         "frame": "east-north-up" if found.on_earth else "celestial",
-        **angles,
+        **dict(zip(names, angles, strict=True)),
         "sigma_deg": list(found.sigma_deg),
         "rotation": found.attitude.rotation.tolist(),
         "left_out": dict(found.detected.left_out),
@@ -522,8 +509,3 @@ def _draw(picture: Path, image: Any, found: NamedStars, catalog: StarCatalog, ti
     star = found.attitude.star.tolist()
     names = [catalog.name_of(int(catalog.number[i])) if i >= 0 else "" for i in star]
     save_picture(picture, stars_figure(image, found.detected.pixels, names, found.attitude.residual, title))
-
-
-def _say_unknown(view: SkyView) -> None:
-    if view.on_earth and view.dut1 is None:
-        out.print("UT1 - UTC is not known (--dut1): it is part of the σ about the Earth's axis with 8″")
