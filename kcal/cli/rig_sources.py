@@ -8,15 +8,15 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from kcal.cli.console import aligned, err, steps, warn
 from kcal.cli.inputs import typed_with
 from kcal.cli.rig_options import Sources
-from kcal.cli.stars import images_by_camera, read_stars
-from kcal.errors import InputError
+from kcal.cli.stars import sky_view
+from kcal.errors import InputError, KcalError
 from kcal.texts import measured_text
-from kcal.values import with_sigma
+from kcal.values import named, with_sigma
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from kcal.lens.camera import Camera
     from kcal.lens.rig import Origin
     from kcal.skyline.attitude import SkylineAttitude, SkylineImage
+    from kcal.stars.night import NamedStars
 
 
 # Drones, ships and aircraft that tell where they are, for `kcal rig --tracks`.
@@ -42,7 +43,7 @@ def _add_tracks(read: RigReading, files: tuple[Path, Path]) -> None:
 
     given, names = read.given, list(read.cameras)
     tracks, frame = read_tracks(files[0], read.origin)
-    if (read.positions or "landmarks" in read.sources) and frame != read.origin:
+    if (read.positions or read.placed) and frame != read.origin:
         raise InputError(f"{files[0]}: it has latitudes, the landmarks or positions local meters; give a --site")
     options = MovingOptions(
         clock_sigma=given.tracks_clock, between_sigma=given.clock_sigma, pixel_sigma=given.marks_sigma
@@ -131,6 +132,123 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     read.add("features", features)
 
 
+# Night images of the cameras of a rig, for `kcal rig --stars`.
+
+# m: how well the place of `--site` is known to be that of the first camera, along each axis, if not stated.
+_PLACE_SIGMA = 3.0
+
+
+def _add_stars(read: RigReading, words: Sequence[str]) -> None:
+    """The stars of all images, the position of the first camera, and lines that say what was found.
+
+    Raises:
+        InputError: no images of one moment.
+    """
+    import torch
+
+    from kcal.calibrate.rig.measured import MeasuredPosition
+    from kcal.stars.rig_stars import moments_of, star_source
+
+    night, cameras, positions = read.given, read.cameras, read.positions
+    given = images_by_camera("--stars", words, tuple(cameras))
+    images = [_named_images(name, given[name], read) if name in given else [] for name in cameras]
+    moments, alone = moments_of(images)
+    on_earth = all(image.on_earth for own in images for image in own)
+    if not any(len(moment) > 1 for moment in moments) and not (on_earth and len(cameras) > 2):
+        first, *_, last = cameras
+        raise InputError(
+            f"--stars: no image of the {first} camera was taken at the time of one of the {last}; "
+            "pairs are of one moment"
+        )
+    if on_earth and not read.placed and not positions:
+        there = torch.zeros(3, dtype=torch.float64)
+        known = night.site.sigma if night.site and night.site.sigma is not None else _PLACE_SIGMA
+        positions = (MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, known)),)
+    frame = read.origin if read.placed or positions else None
+    source = star_source(
+        moments, list(cameras.values()), clock_sigma=night.clock_sigma, drift_sigma=night.clock_drift, origin=frame
+    )
+    named = int(source.named.sum())
+    read.sources |= {"stars": source, "positions": positions}
+    read.notes += [
+        f"stars: {len(moments)} moments, {len(source.names)} stars, {named} with a direction on the Earth"
+        + (f"; {alone} images without partner" if alone else ""),
+        f"clocks of the cameras against each other: ± {night.clock_sigma:g} s, which no residual shows: up to "
+        f"{math.degrees(7.292e-5 * night.clock_sigma):.5f}° of relative attitude, and part of every σ below",
+    ]
+    if any(effect.factor is not None for effect in source.effects):
+        read.notes.append(
+            f"their drift: ± {night.clock_drift:g} s an hour since the night's first images (--clock-drift 0 where GPS "
+            "or a network keeps them)"
+        )
+    if on_earth and night.dut1 is None:
+        read.notes.append("UT1 - UTC is not known (--dut1): 8″ of heading, part of its σ")
+
+
+def images_by_camera(option: str, words: Sequence[str], names: Sequence[str]) -> dict[str, list[str]]:
+    """Which images are whose: one place for each camera, in their order; NAME=IMAGES; or files in a folder of each.
+
+    Args:
+        option: what the images were given with.
+        words: files, folders and wildcards, or such with a name before them.
+        names: of the cameras.
+
+    Raises:
+        InputError: another number of places than of cameras, or a name that no camera has.
+
+    Example:
+        >>> images_by_camera("--stars", ["l/1.png", "l/2.png", "r/1.png"], ("left", "right"))
+        {'left': ['l/1.png', 'l/2.png'], 'right': ['r/1.png']}
+    """
+    found: dict[str, list[str]] = {}
+    if words and all("=" in word and not Path(word).exists() for word in words):
+        for word in words:
+            name, images = named(word, option, "NAME=IMAGES for each camera")
+            if name not in names:
+                raise InputError(f"{option} {word}: write NAME=IMAGES; the cameras are {', '.join(names)}")
+            found.setdefault(name, []).append(images)
+        return found
+    folders = list(dict.fromkeys(Path(word).parent for word in words))
+    if len(names) == 1:
+        return {names[0]: list(words)}
+    if len(words) == len(names):
+        return {name: [word] for name, word in zip(names, words, strict=True)}
+    if len(folders) == len(names):
+        return {name: [word for word in words if Path(word).parent == own]
+                for name, own in zip(names, folders, strict=True)}  # fmt: skip
+    places = " ".join(name.upper() for name in names)
+    raise InputError(f"{option}: give a folder or a quoted wildcard for each camera, {places}; or NAME=IMAGES for each")
+
+
+def _named_images(side: str, given: list[str], read: RigReading) -> list[NamedStars]:
+    from kcal.stars.detect import expand_nights, read_night
+    from kcal.stars.night import clock_doubts, name_stars
+
+    files, night = expand_nights(given), read.given
+    found: list[NamedStars] = []
+    # A place without a time tells nothing.
+    place = read.origin if night.time is not None else None
+    with steps(f"naming stars of {side}", len(files)) as advance:
+        for path in files:
+            view = sky_view(
+                path, night.time, place, dut1=night.dut1, temperature=night.temperature, pressure=night.pressure
+            )
+            try:
+                image = name_stars(read_night(path), read.cameras[side], view)
+            except KcalError as error:
+                warn(f"{side} {path.name}: {error}; left out")
+            else:
+                for text in image.warnings:
+                    warn(f"{side} {path.name}: {text}")
+                found.append(image)
+            advance(path.name)
+    for number, text in clock_doubts(found):
+        warn(f"{side}, image {number + 1} with names: {text}")
+    if not found:
+        raise InputError(f"--stars: in none of the {len(files)} images of {side} stars have names")
+    return found
+
+
 # A terrain raster and images of the skyline, for `kcal rig --skyline` and `kcal station --skyline`.
 
 
@@ -209,7 +327,6 @@ def _lines(image: SkylineImage, names: Sequence[str], found: SkylineAttitude) ->
 
 # Refuse cameras and views that are in each other's place, or not of one another: by names and sizes in the files.
 
-_Given = TypeVar("_Given")
 _SIDE = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 
 
@@ -234,15 +351,21 @@ def check_views_of(cameras: Sequence[Camera], seen: Sequence[Observations], path
     Raises:
         InputError: with the file, the camera and, where the files are exchanged, the right command.
     """
-    for camera, views, path in zip(cameras, seen, paths, strict=True):
-        if camera.size != views.image_size and len(cameras) == 1:
-            raise InputError(_other_size(camera, views, path))
-    if len(cameras) != 2:
+    if len(cameras) > 2:
         return
-    sizes = [camera.size for camera in cameras]
-    views_sizes = [views.image_size for views in seen]
-    exchanged = sizes != views_sizes and sizes == views_sizes[::-1]
-    if exchanged or _are_exchanged(cameras, paths, _by_file) or _are_exchanged(cameras, seen, _by_images):
+    sizes, views_sizes = [camera.size for camera in cameras], [views.image_size for views in seen]
+    records = [camera.calibration.record if camera.calibration else None for camera in cameras]
+
+    def crossed(fits: Callable[[CalibrationRecord, int], bool]) -> bool:
+        """Whether each camera was calibrated from what the other was given, and neither from its own."""
+        known = [[record is not None and fits(record, i) for i in range(len(paths))] for record in records]
+        return known == [[False, True], [True, False]]
+
+    if (
+        (sizes != views_sizes and sizes == views_sizes[::-1])
+        or crossed(lambda record, i: record.observations == paths[i].name)
+        or crossed(lambda record, i: set(record.per_view_rms) <= set(seen[i].names))
+    ):
         raise InputError(
             f"{paths[0]}: these are views of the right camera, and {paths[1]} has those of the left one: they are "
             f"exchanged. Perhaps: {_exchanged(paths)}"
@@ -259,23 +382,6 @@ def _other_size(camera: Camera, views: Observations, path: Path) -> str:
         f"{camera.size[0]}x{camera.size[1]} px: these are not its views. To calibrate from them: "
         f"kcal calibrate {path} -o {path.name.split('.')[0]}.camera.json"
     )
-
-
-def _are_exchanged(
-    cameras: Sequence[Camera], given: Sequence[_Given], of: Callable[[CalibrationRecord, _Given], bool]
-) -> bool:
-    """Whether each camera was calibrated from what the other was given, and neither from its own."""
-    known = [camera.calibration.record if camera.calibration else None for camera in cameras]
-    first, second = ([record is not None and of(record, one) for one in given] for record in known)
-    return [first, second] == [[False, True], [True, False]]
-
-
-def _by_file(record: CalibrationRecord, path: Path) -> bool:
-    return record.observations == path.name
-
-
-def _by_images(record: CalibrationRecord, views: Observations) -> bool:
-    return set(record.per_view_rms) <= set(views.names)
 
 
 def _exchanged(paths: Sequence[Path]) -> str:
@@ -318,6 +424,11 @@ class RigReading:
     def positions(self) -> tuple[MeasuredPosition, ...]:
         """Measured positions of the cameras."""
         return self.sources.get("positions", ())
+
+    @property
+    def placed(self) -> bool:
+        """Whether landmarks place the cameras."""
+        return "landmarks" in self.sources
 
     def add(self, field: str, source: Any) -> None:
         """Add to a field of `RigData`, to what is there already."""
@@ -403,14 +514,6 @@ def _add_landmarks(read: RigReading, path: Path) -> None:
     for some, text in ((found.unmarked, "surveyed, but not marked"), (found.unsurveyed, "marked, not surveyed")):
         if some:
             err.print(f"[yellow]warning:[/] {text}:", ", ".join(some), markup=True)
-
-
-def _add_stars(read: RigReading, _: Sequence[str]) -> None:
-    """Stars of night images."""
-    placed = "landmarks" in read.sources
-    stars, positions, lines = read_stars(read.cameras, read.given, read.origin, read.positions, placed=placed)
-    read.sources |= {"stars": stars, "positions": positions}
-    read.notes += lines
 
 
 def _add_features(read: RigReading, path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,14 +13,9 @@ from kcal.cli.inputs import single_camera
 from kcal.cli.options import Kind
 from kcal.errors import InputError, KcalError
 from kcal.files import check_writable
-from kcal.values import named
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
-    from kcal.calibrate.rig.measured import MeasuredPosition
-    from kcal.calibrate.rig.stars import StarSource
-    from kcal.cli.rig_options import Sources
-    from kcal.lens.camera import Camera
     from kcal.lens.rig import Origin, Rig
     from kcal.stars.detect import DetectedStars
     from kcal.stars.lens import StarCamera
@@ -250,136 +244,6 @@ def sparse_parts(found: StarCamera, size: tuple[int, int]) -> list[str]:
         f"{share} % of the image saw fewer than {_FEW_IN_A_PART} stars ({', '.join(empty)}): tilt the camera up and "
         "take more images, so that bright stars fall there"
     ]
-
-
-# Night images of the cameras of a rig, for `kcal rig --stars`.
-
-# m: how well the place of `--site` is known to be that of the first camera, along each axis, if not stated.
-_PLACE_SIGMA = 3.0
-
-
-def read_stars(
-    cameras: Mapping[str, Camera],
-    night: Sources,
-    origin: Origin | None,
-    positions: tuple[MeasuredPosition, ...],
-    *,
-    placed: bool,
-) -> tuple[StarSource, tuple[MeasuredPosition, ...], list[str]]:
-    """The stars of all images, the positions with that of the first camera, and lines that say what was found.
-
-    Args:
-        cameras: by their names, in order.
-        night: what the user gave.
-        origin: of the rig's frame; None if nothing is known on the Earth.
-        positions: measured ones.
-        placed: whether landmarks or anything else places the rig already.
-    """
-    import torch
-
-    from kcal.calibrate.rig.measured import MeasuredPosition
-    from kcal.stars.rig_stars import moments_of, star_source
-
-    given = images_by_camera("--stars", night.stars or (), tuple(cameras))
-    images = [_named_images(name, given[name], camera, night, origin) if name in given else []
-              for name, camera in cameras.items()]  # fmt: skip
-    moments, alone = moments_of(images)
-    on_earth = all(image.on_earth for own in images for image in own)
-    if not any(len(moment) > 1 for moment in moments) and not (on_earth and len(cameras) > 2):
-        first, *_, last = cameras
-        raise InputError(
-            f"--stars: no image of the {first} camera was taken at the time of one of the {last}; "
-            "pairs are of one moment"
-        )
-    if on_earth and not placed and not positions:
-        there = torch.zeros(3, dtype=torch.float64)
-        known = night.site.sigma if night.site and night.site.sigma is not None else _PLACE_SIGMA
-        positions = (MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, known)),)
-    frame = origin if placed or positions else None
-    source = star_source(
-        moments, list(cameras.values()), clock_sigma=night.clock_sigma, drift_sigma=night.clock_drift, origin=frame
-    )
-    named = int(source.named.sum())
-    lines = [
-        f"stars: {len(moments)} moments, {len(source.names)} stars, {named} with a direction on the Earth"
-        + (f"; {alone} images without partner" if alone else ""),
-        f"clocks of the cameras against each other: ± {night.clock_sigma:g} s, which no residual shows: up to "
-        f"{math.degrees(7.292e-5 * night.clock_sigma):.5f}° of relative attitude, and part of every σ below",
-    ]
-    if any(effect.factor is not None for effect in source.effects):
-        lines.append(
-            f"their drift: ± {night.clock_drift:g} s an hour since the night's first images (--clock-drift 0 where GPS "
-            "or a network keeps them)"
-        )
-    if on_earth and night.dut1 is None:
-        lines.append("UT1 - UTC is not known (--dut1): 8″ of heading, part of its σ")
-    return source, positions, lines
-
-
-def images_by_camera(option: str, words: Sequence[str], names: Sequence[str]) -> dict[str, list[str]]:
-    """Which images are whose: one place for each camera, in their order; NAME=IMAGES; or files in a folder of each.
-
-    Args:
-        option: what the images were given with.
-        words: files, folders and wildcards, or such with a name before them.
-        names: of the cameras.
-
-    Raises:
-        InputError: another number of places than of cameras, or a name that no camera has.
-
-    Example:
-        >>> images_by_camera("--stars", ["l/1.png", "l/2.png", "r/1.png"], ("left", "right"))
-        {'left': ['l/1.png', 'l/2.png'], 'right': ['r/1.png']}
-    """
-    found: dict[str, list[str]] = {}
-    if words and all("=" in word and not Path(word).exists() for word in words):
-        for word in words:
-            name, images = named(word, option, "NAME=IMAGES for each camera")
-            if name not in names:
-                raise InputError(f"{option} {word}: write NAME=IMAGES; the cameras are {', '.join(names)}")
-            found.setdefault(name, []).append(images)
-        return found
-    folders = list(dict.fromkeys(Path(word).parent for word in words))
-    if len(names) == 1:
-        return {names[0]: list(words)}
-    if len(words) == len(names):
-        return {name: [word] for name, word in zip(names, words, strict=True)}
-    if len(folders) == len(names):
-        return {name: [word for word in words if Path(word).parent == own]
-                for name, own in zip(names, folders, strict=True)}  # fmt: skip
-    places = " ".join(name.upper() for name in names)
-    raise InputError(f"{option}: give a folder or a quoted wildcard for each camera, {places}; or NAME=IMAGES for each")
-
-
-def _named_images(
-    side: str, given: list[str], camera: Camera, night: Sources, origin: Origin | None
-) -> list[NamedStars]:
-    from kcal.stars.detect import expand_nights, read_night
-    from kcal.stars.night import clock_doubts, name_stars
-
-    files = expand_nights(given)
-    found: list[NamedStars] = []
-    # A place without a time tells nothing.
-    place = origin if night.time is not None else None
-    with steps(f"naming stars of {side}", len(files)) as advance:
-        for path in files:
-            view = sky_view(
-                path, night.time, place, dut1=night.dut1, temperature=night.temperature, pressure=night.pressure
-            )
-            try:
-                image = name_stars(read_night(path), camera, view)
-            except KcalError as error:
-                warn(f"{side} {path.name}: {error}; left out")
-            else:
-                for text in image.warnings:
-                    warn(f"{side} {path.name}: {text}")
-                found.append(image)
-            advance(path.name)
-    for number, text in clock_doubts(found):
-        warn(f"{side}, image {number + 1} with names: {text}")
-    if not found:
-        raise InputError(f"--stars: in none of the {len(files)} images of {side} stars have names")
-    return found
 
 
 # `kcal stars`: name the stars of night images, and find how the camera looks.

@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,14 +15,14 @@ from typer.testing import CliRunner, Result
 from kcal.cli.demo_practice import _first, _short_meters, _signed
 from kcal.cli.main import app
 from kcal.cli.rig_options import Sources
-from kcal.cli.rig_sources import parse_baselines, place_names, read_sources
+from kcal.cli.rig_sources import READERS, RigReading, parse_baselines, place_names, read_sources
 from kcal.errors import InputError
 from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import save_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin, Rig
+from kcal.lens.rig import Rig
 
 CAMERAS = [
     Camera.build(focal=(1600 + 5 * k, 1600), center=(960, 540), size=(1920, 1080), model="pinhole") for k in range(2)
@@ -105,13 +104,11 @@ class TestSources:
     ) -> None:
         told: list[tuple[list[str], bool]] = []
 
-        def stars(
-            cameras: dict[str, Camera], options: object, origin: Origin | None, positions: object, *, placed: bool
-        ) -> Any:
-            told.append((list(cameras), placed))
-            return None, positions, ["a note of the stars"]
+        def stars(read: RigReading, _: object) -> None:
+            told.append((list(read.cameras), read.placed))
+            read.notes.append("a note of the stars")
 
-        monkeypatch.setattr("kcal.cli.rig_sources.read_stars", stars)
+        monkeypatch.setitem(READERS, "stars", stars)
         survey, marks = tmp_path / "survey.csv", tmp_path / "marks.csv"
         survey.write_text("name,east,north,up,sigma\n" + "".join(f"p{k},{k},{100 + k},2,0.02\n" for k in range(3)))
         marks.write_text("name,left_u,left_v,right_u,right_v\n" + "".join(f"p{k},{k},1,2,3\n" for k in range(3)))

@@ -13,7 +13,7 @@ from command_line import Command
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
-from kcal.cli.stars import images_by_camera
+from kcal.cli.rig_sources import images_by_camera
 from kcal.errors import FileError, InputError
 from kcal.io.rig_file import save_rig
 from kcal.locate import marks as tables
