@@ -100,6 +100,7 @@ def live_command(
         start: Calendar time of second 0, if times are not Unix seconds; for events.
     """
     from kcal.io.rig_file import load_rig
+    from kcal.locate.points import PointLocator
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.grouping import read_moment
     from kcal.pipeline.measurements import ClockPrior
@@ -107,8 +108,6 @@ def live_command(
     from kcal.pipeline.stream import Stream, lines_of
     from kcal.pipeline.tracks import Tracker, TrackOptions
 
-    if (options.site is None) != (options.heading is None):
-        raise typer.BadParameter("--site and --heading belong together")
     if (detections is None) == (not videos):
         raise typer.BadParameter("give videos and --detector, or --detections")
     known = load_rig(rig)
@@ -125,20 +124,25 @@ def live_command(
         check_writable(path, rig, *([lines] if lines else []), *(videos or []))
     clock = ClockPrior(offset_s=clock_offset, offset_sigma_s=clock_sigma, drift_sigma=clock_sigma / 3600.0)
     joining = AssociationOptions(box_sigma=box_sigma)
-    localize, run = _stations(rig, known, options.pixel_sigma) if many else _mast(known, options)
+    localize = _localizer(rig, known, options, many=many)
     solved = localize if many else localize.rig
 
     if compile:
         err.print("compiling: some three minutes the first time")
     follow = TrackOptions.for_video(match_sigma) if videos else None
-    moments, moving = (None, 0) if options.history is None else _moments(options.history, localize)
+    moments, moving = None, 0
+    if options.history is not None:
+        from kcal.watch.watcher import MORE_ERRORS, Followed
+
+        # The rig as it stands at each second, by a history that grows, and how many errors more that has.
+        moments, moving = Followed(options.history, localize), MORE_ERRORS
     tracker = Tracker(localize, follow, clock=clock, compiled=compile, moments=moments, moving=moving)
     frames = _videos(videos, detector, solved, tracker, joining, match_sigma) if videos and detector else None
     source = frames or lines_of(lines, lambda line: read_moment(line, solved, joining, float(localize.pixel_sigma)))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
     with steps("live", lines.stat().st_size if lines is not None and lines.is_file() else None) as advance:
         stream = Stream(
-            tracker, run, output, log,
+            tracker, PointLocator(localize).located(), output, log,
             senders=[sender_to(address) for address in to or []], start=start, shown=None,
         )  # fmt: skip
         page = None if port is None else _live_map(stream.run, port, start)
@@ -183,13 +187,6 @@ def live_command(
             err.print(f"{whose} images are {late} later than their times say", markup=False)
 
 
-def _moments(history: Path, localize: Localizer) -> tuple[Callable[[float], Localizer], int]:
-    """The rig as it stands at each second, by a history that grows; and how many errors more that has."""
-    from kcal.watch.watcher import MORE_ERRORS, Followed
-
-    return Followed(history, localize), MORE_ERRORS
-
-
 def summary(counts: StreamCounts) -> str:
     """What happened, in one line."""
     parts = [f"{counts.moments:,} moments, {counts.positions:,} positions"]
@@ -205,27 +202,19 @@ def summary(counts: StreamCounts) -> str:
     return "; ".join(parts)
 
 
-def _mast(known: Rig, options: LocateOptions) -> tuple[Localizer, Located]:
-    """Two cameras, and how positions of them are told."""
-    from kcal.locate.points import PointLocator
-
-    localize = pair_localizer(known, options, pixel_sigma_of(options.pixel_sigma, known))(known)
-    return localize, PointLocator(localize).located()
-
-
-def _stations(path: Path, rig: Rig, pixel_sigma: float | None) -> tuple[Localizer, Located]:
-    """Many cameras, and how positions of them are told."""
+def _localizer(path: Path, rig: Rig, options: LocateOptions, *, many: bool) -> Localizer:
+    """Of two cameras, or of many."""
     from kcal.locate.localizer import Localizer
-    from kcal.locate.points import PointLocator
     from kcal.locate.stations import stations_of
 
+    if not many:
+        return pair_localizer(rig, options, pixel_sigma_of(options.pixel_sigma, rig))(rig)
     known = stations_of(rig)
     if known.origin is None:
         raise InputError(
             f"{path}: this rig has no place on the Earth; solve it with landmarks or positions with latitudes"
         )
-    localize = Localizer(known, weights="all", pixel_sigma=pixel_sigma_of(pixel_sigma, known))
-    return localize, PointLocator(localize).located()
+    return Localizer(known, weights="all", pixel_sigma=pixel_sigma_of(options.pixel_sigma, known))
 
 
 def _videos(

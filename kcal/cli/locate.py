@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from kcal.locate.positions import Located
     from kcal.locate.tables import PositionColumns
 
+    # Positions; where bearings count from, of several cameras; whether the table states the noise of its marks; and how
+    # far it has been read.
+    LocatedPart = tuple[PositionColumns, Tensor | None, bool, int]
     Locate = Callable[[Marks], tuple[PositionColumns, Tensor | None]]
 
 
@@ -133,47 +136,30 @@ class LocateOptions:
     geoid: Rare[kinds.Meters] = 0.0
     geoid_grid: Rare[Path | None] = None
 
+    def __post_init__(self) -> None:
+        if (self.site is None) != (self.heading is None):
+            raise typer.BadParameter("--site and --heading belong together")
+        if self.heading is None and (self.pitch or self.roll or self.grid is not None):
+            raise typer.BadParameter(
+                "--pitch, --roll and --grid belong to --heading; the rig file has its own attitude"
+            )
 
-class LocatedPart(NamedTuple):
-    """Some rows of a table.
 
-    Attributes:
-        columns: their positions.
-        feet: (N, 3) where bearings count from, of several cameras; None: the left camera.
-        stated: whether the table says how noisy its marks are.
-        bytes_read: how far it has been read.
+def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[PointLocator, Iterator[LocatedPart], str]:
+    """Read a rig and begin a table: marks of several cameras, or of one with a height or a terrain, or pairs.
+
+    Returns:
+        by which it is located; what locates it, part by part; and where the noise of marks is from, to be said if the
+        table does not state it.
     """
-
-    columns: PositionColumns
-    feet: Tensor | None
-    stated: bool
-    bytes_read: int
-
-
-class LocateRun(NamedTuple):
-    """A table that is about to be located.
-
-    Attributes:
-        locate: by which it is.
-        parts: locates it, part by part.
-        note: where the noise of marks is from, to be said if the table does not state it.
-    """
-
-    locate: PointLocator
-    parts: Iterator[LocatedPart]
-    note: str
-
-
-def locate_run(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
-    """Read a rig and begin a table: marks of several cameras, or of one with a height or a terrain, or pairs."""
     from kcal.io.rig_file import load_rig
+    from kcal.lens.rig import RigCovariance
     from kcal.locate.localizer import Localizer
     from kcal.locate.marks import is_long, read_mark_chunks
     from kcal.locate.points import PointLocator
     from kcal.locate.raster import terrain
     from kcal.locate.tabulate import find_geoid
 
-    own = options
     solved = load_rig(rig)
     stated = own.height is not None or own.terrain is not None
     many = stated or is_long(points) or len(solved) != 2 or not solved.in_first_frame
@@ -185,21 +171,31 @@ def locate_run(rig: Path, points: Path, options: LocateOptions) -> LocateRun:
     for text in solved.calibration.warnings if solved.calibration else ():
         warn(f"{rig}: {text}")
     by_moments: Locate | None = None
+    geoid = find_geoid(own.geoid_grid)
     if many:
         ground = None if own.terrain is None else terrain(own.terrain, own.geoid)
         locate = PointLocator(
-            Localizer(solved, weights="all", pixel_sigma=noise), geoid=find_geoid(own.geoid_grid), ground=ground,
+            Localizer(solved, weights="all", pixel_sigma=noise), geoid=geoid, ground=ground,
             height=own.height if ground is None else (0.0, own.terrain_sigma),
         )  # fmt: skip
     else:
-        locate, by_moments = _of_pairs(solved, own, noise)
+        localize = pair_localizer(solved, own, noise)
+        if own.history is not None:
+            # Loads OpenCV and SciPy, which nothing else here needs.
+            from kcal.watch.watcher import located_at
+
+            if solved.covariance is None:
+                # Not exact: moments add what is not known of them.
+                solved.covariance = RigCovariance.of(solved)
+            by_moments = located_at(own.history, solved, lambda rig: PointLocator(localize(rig), geoid=geoid))
+        locate = PointLocator(localize(solved), geoid=geoid)
 
     def parts() -> Iterator[LocatedPart]:
         for marks, read in read_mark_chunks(points, solved.names, single=many):
             columns, feet = (by_moments or locate)(marks)
-            yield LocatedPart(columns, feet, marks.covariance_or(noise) is not None, read)
+            yield columns, feet, marks.covariance_or(noise) is not None, read
 
-    return LocateRun(locate, parts(), note)
+    return locate, parts(), note
 
 
 def _refuse_of_pairs(own: LocateOptions) -> None:
@@ -211,28 +207,6 @@ def _refuse_of_pairs(own: LocateOptions) -> None:
         )
     if own.height is not None and own.terrain is not None:
         raise typer.BadParameter("--height and --terrain both say where a point that one camera saw stands: give one")
-
-
-def _of_pairs(solved: Rig, own: LocateOptions, noise: float) -> tuple[PointLocator, Locate | None]:
-    """What locates pairs, and what does so by the history of a watched rig."""
-    from kcal.lens.rig import RigCovariance
-    from kcal.locate.points import PointLocator
-    from kcal.locate.tabulate import find_geoid
-
-    localize, geoid = pair_localizer(solved, own, noise), find_geoid(own.geoid_grid)
-
-    def locator(standing: Rig) -> PointLocator:
-        return PointLocator(localize(standing), geoid=geoid)
-
-    if own.history is None:
-        return locator(solved), None
-    if solved.covariance is None:
-        # Not exact: moments add what is not known of them.
-        solved.covariance = RigCovariance.of(solved)
-    # Loads OpenCV and SciPy, which nothing else here needs.
-    from kcal.watch.watcher import located_at
-
-    return locator(solved), located_at(own.history, solved, locator)
 
 
 def pair_localizer(solved: Rig, own: LocateOptions, noise: float) -> Callable[[Rig], Localizer]:
@@ -361,12 +335,8 @@ def locate_command(
 
         check_map_format(map_)
         check_writable(map_)
-    if (options.site is None) != (options.heading is None):
-        raise typer.BadParameter("--site and --heading belong together")
-    if options.heading is None and (options.pitch or options.roll or options.grid is not None):
-        raise typer.BadParameter("--pitch, --roll and --grid belong to --heading; the rig file has its own attitude")
-    run = locate_run(rig, points, options)
-    empty = run.locate.located()
+    locate, parts, note = locate_run(rig, points, options)
+    empty = locate.located()
     for path in outputs:
         check_place(f"positions{suffix}" if path == STREAM else path, empty)
     if not empty.origin:
@@ -380,16 +350,16 @@ def locate_command(
             size = points.stat().st_size if points.is_file() else None
             with open_writers(outputs, empty, suffix) as writers, steps("locating", size) as advance:
                 read, stated = 0, False
-                for part in run.parts:
-                    stated = stated or part.stated
+                for columns, feet, known, end in parts:
+                    stated = stated or known
                     for writer in writers:
-                        writer.add(part.columns)
-                    sample.add(part.columns, part.feet)
-                    advance(f"{sample.count:,} rows", part.bytes_read - read)
-                    read = part.bytes_read
-                if run.note and not stated:
-                    err.print(run.note)
-                located = sample.located(run.locate)
+                        writer.add(columns)
+                    sample.add(columns, feet)
+                    advance(f"{sample.count:,} rows", end - read)
+                    read = end
+                if note and not stated:
+                    err.print(note)
+                located = sample.located(locate)
                 true = None if truth is None else read_truth(truth, located)
             draw_positions(located, true, picture, map_, tiles=tiles, image=image, online=online)
         except KeyboardInterrupt:

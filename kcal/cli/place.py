@@ -9,6 +9,7 @@ import typer
 from kcal.cli import kinds
 from kcal.cli.console import err, out, print_wrote
 from kcal.cli.options import Several
+from kcal.cli.rig_sources import load_cameras
 from kcal.cli.stations import camera_names, print_stands
 from kcal.errors import InputError
 from kcal.files import check_writable
@@ -50,11 +51,10 @@ def place_command(
         places: In place of these a table: name (of the camera), lat, lon, height, sigma, heading, heading_sigma, pitch,
             pitch_sigma, and if need be sigma_up, roll, roll_sigma.
     """
-    check_writable(output, *cameras, *([] if places is None else [places]))
+    check_writable(output, *cameras, *filter(None, [places]))
     typed = {"--site": site, "--heading": heading, "--pitch": pitch}
     if (places is None) == any(value is None for value in typed.values()) or (places and (roll or any(typed.values()))):
         raise typer.BadParameter("give --site, --heading and --pitch of each camera, or all of them in --places")
-    from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import save_rig
     from kcal.locate.stations import read_stands, station_rig
 
@@ -63,9 +63,8 @@ def place_command(
         stands = dict(zip(names, _typed_stands(len(names), site or [], heading or [], pitch or [], roll), strict=True))
     else:
         stands = read_stands(places, None if len(names) == 1 else names)
-    lenses = {path: load_camera(path) for path in dict.fromkeys(cameras)}
-    paths = cameras * len(stands) if len(cameras) == 1 else cameras
-    rig = station_rig({name: lenses[path] for name, path in zip(stands, paths, strict=True)}, [*stands.values()])
+    lenses = load_cameras(cameras * len(stands) if len(cameras) == 1 else cameras)
+    rig = station_rig(dict(zip(stands, lenses, strict=True)), [*stands.values()])
     save_rig(rig, output)
     print_stands(rig)
     print_wrote(output)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import itertools
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -197,8 +198,6 @@ def _landmarks(rig: Rig, path: Path, now: Marks, sigma: float) -> Landmarks:
 
 def print_turns(drift: Drift, used: str = "") -> None:
     """Print what has turned by how much, and of how many points that was found, if that is known."""
-    import math
-
     rows = [["turn of", "pitch °", "yaw °", "roll °", *(["used"] if used else [])]]
     for name, turn, covariance in drift.turns:
         both = zip(turn.tolist(), covariance.diagonal().sqrt().tolist(), strict=True)
@@ -208,8 +207,6 @@ def print_turns(drift: Drift, used: str = "") -> None:
 
 
 def _print_effect(drift: Drift) -> None:
-    import math
-
     for distance, found, sigma in zip(*(value.tolist() for value in drift.effect()), strict=True):
         shift = "infinity" if math.isinf(found) else f"{found:.1f} m ({found - distance:+z.1f} ± {sigma:.1f} m)"
         out.print(f"with the old rig a target at {distance:g} m is found at {shift}")
