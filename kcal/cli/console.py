@@ -337,15 +337,10 @@ def views_cure(error: object, seen: Observations, observations: Path) -> str:
     return look_at_views(seen, observations)
 
 
-def mark_again(
-    survey: Path | None, marks: Path | None, *, rig: Path | None = None, cameras: tuple[Path, Path] | None = None
-) -> str:
+def mark_again(*words: object, marks: Path | None = None) -> str:
     """The command that shows marks in the images and takes more."""
-    words = ["kcal", "mark", "left.png", "right.png"]
-    words += [] if rig is None else ["--rig", str(rig)]
-    words += [] if cameras is None else ["--cameras", *map(str, cameras)]
-    words += [] if rig is not None else ["--landmarks", str(survey or "survey.csv")]
-    return f"To mark in the images: {shlex.join([*words, '-o', str(marks or 'marks.csv')])}"
+    line = ["kcal", "mark", "left.png", "right.png", *map(str, words), "-o", str(marks or "marks.csv")]
+    return f"To mark in the images: {shlex.join(line)}"
 
 
 def _millimeters(meters: float) -> str:

@@ -380,4 +380,4 @@ def locate_command(
     if "ok" not in sample.statuses:
         rows = "pairs" if located.feet is None else "points"
         text = f"{points}: none of the {sample.count} {rows} could be located; see the table"
-        raise DegenerateError(console.with_command(text, console.mark_again(None, None, rig=rig)))
+        raise DegenerateError(console.with_command(text, console.mark_again("--rig", rig)))

@@ -155,7 +155,8 @@ def _cure_of_sources(paths: Sequence[Path], sources: Sources, error: object) -> 
         return ""
     if sources.pairs and sources.landmarks is None and isinstance(error, InputError):
         return console.look_at_views(Observations.load(sources.pairs[0]), sources.pairs[0])
-    return console.mark_again(sources.landmarks, sources.marks, cameras=(paths[0], paths[1]))
+    survey = sources.landmarks or "survey.csv"
+    return console.mark_again("--cameras", *paths, "--landmarks", survey, marks=sources.marks)
 
 
 def solve_and_write(
