@@ -268,8 +268,11 @@ def calibrate_command(
     stood = stated_settings(setting, len(obs or [output]))
     if obs is None and any(stood):
         raise InputError("--setting: cameras of stars alone do not keep it; give observations of a board as well")
-    if by_night(stars, obs, time, site, output, name) or obs is None:
+    if not obs:
+        by_night(stars, time, site, output, name)
         return
+    if stars and len(obs) > 1:
+        raise InputError("--stars are of one camera: calibrate each with its own boards and night images")
     needs = required(require)
     if board_shape not in ("printed", "exact"):
         check_file("--board-shape", board_shape, BOARD)

@@ -87,11 +87,6 @@ Inner = Annotated[str, Kind(metavar="CxR")]
 Side = Annotated[str, Kind(metavar="LENGTH")]
 
 
-def read_time(text: str, name: str) -> datetime.datetime:
-    """A time with its zone."""
-    return values.instant(text, name)
-
-
 Times = Annotated[
     str,
     Kind(
@@ -99,7 +94,7 @@ Times = Annotated[
         about="When, with its zone: 2026-11-24T20:47:26Z; name:Z or name:+02:00 reads it from each file's name.",
     ),
 ]
-Time = Annotated[datetime.datetime, Kind(metavar="TIME", read=read_time)]
+Time = Annotated[datetime.datetime, Kind(metavar="TIME", read=values.instant)]
 
 
 class KnownPlace(NamedTuple):

@@ -130,33 +130,18 @@ _PARTS = 3
 _FEW_IN_A_PART = 3
 
 
-def by_night(
-    images: list[str] | None,
-    observations: list[Path] | None,
-    time: str | None,
-    place: str | None,
-    output: Path,
-    name: str,
-) -> bool:
+def by_night(images: list[str] | None, time: str | None, place: str | None, output: Path, name: str) -> None:
     """Calibrate a camera from the stars of night images alone, and write it.
 
     Args:
         images: files, folders and wildcards.
-        observations: of boards.
         time: as `--time`.
         place: as `--site`: latitude, longitude and height, for refraction.
         output: camera file.
         name: of the camera.
-
-    Returns:
-        whether that was done; not where there are boards.
     """
     from kcal.io.camera_file import save_camera
 
-    if observations:
-        if images and len(observations) > 1:
-            raise InputError("--stars are of one camera: calibrate each with its own boards and night images")
-        return False
     if not images:
         raise InputError("give observations of a board (from `kcal detect`), or night images with --stars")
     found = _by_stars(images, time, place, output)
@@ -166,15 +151,12 @@ def by_night(
     save_camera(camera, output)
     out.print("at infinity, without an entrance pupil: for what is farther than some hundred pupil movements")
     print_wrote(output)
-    return True
 
 
 def joined_by_stars(
-    boards: CameraCalibrationResult | KcalError, images: list[str], time: str | None, place: str | None, output: Path
-) -> CameraCalibrationResult | KcalError:
-    """The calibration by boards, refined by stars; a failure stays one. Other arguments as of `by_night`."""
-    if isinstance(boards, KcalError):
-        return boards
+    boards: CameraCalibrationResult, images: list[str], time: str | None, place: str | None, output: Path
+) -> CameraCalibrationResult:
+    """The calibration by boards, refined by stars. Other arguments as of `by_night`."""
     found = _by_stars(images, time, place, output, boards)
     agreement, joint = found.agreement, found.joint
     assert agreement is not None
