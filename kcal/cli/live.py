@@ -22,11 +22,8 @@ from kcal.files import check_writable
 from kcal.texts import measured_text
 
 if TYPE_CHECKING:
-    import datetime
-
     from kcal.lens.rig import Rig
     from kcal.locate.localizer import Localizer
-    from kcal.locate.positions import Located
     from kcal.locate.tables import PositionColumns
     from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.senders import LiveMap
@@ -145,7 +142,12 @@ def live_command(
             tracker, PointLocator(localize).located(), output, log,
             senders=[sender_to(address) for address in to or []], start=start, shown=None,
         )  # fmt: skip
-        page = None if port is None else _live_map(stream.run, port, start)
+        page = None
+        if port is not None:
+            with with_extra("mark", "--port needs"):
+                from kcal.pipeline.senders import LiveMap
+            page = LiveMap(stream.run, port, start)
+            err.print(f"live map: {page.address}", markup=False)
         stream.shown = _progress(advance, stream, page)
         if stream.ledger.place.sequence:
             err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)
@@ -240,14 +242,6 @@ def _videos(
         err.print(text, markup=False)
 
     return Videos(videos, rig, load_detector(detector), options, late=late, match_sigma=match_sigma, tell=tell)
-
-
-def _live_map(run: Located, port: int, start: datetime.datetime | None) -> LiveMap:
-    with with_extra("mark", "--port needs"):
-        from kcal.pipeline.senders import LiveMap
-    page = LiveMap(run, port, start)
-    err.print(f"live map: {page.address}", markup=False)
-    return page
 
 
 def _progress(

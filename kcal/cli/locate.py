@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -36,21 +36,6 @@ if TYPE_CHECKING:
 
 
 # What `kcal locate` prints and draws of positions.
-
-
-def draw_positions(
-    located: Located, true: Tensor | None, picture: Path | None, web_map: Path | None, **background: Any
-) -> None:
-    """Write the picture and the map, where they were asked for."""
-    if picture is not None:
-        from kcal.report.figures import save_picture
-        from kcal.report.positions import positions_figure, stations_figure
-
-        save_picture(picture, (positions_figure if located.feet is None else stations_figure)(located, true))
-    if web_map is not None:
-        from kcal.report.map_page import save_map
-
-        save_map(web_map, located, true, **background)
 
 
 def counts_text(rows: int, statuses: dict[str, int]) -> str:
@@ -331,7 +316,7 @@ def locate_command(
         check_format(path)
         check_writable(path, rig, points, *([truth] if truth else []))
     if map_ is not None:
-        from kcal.report.map_page import check_map_format
+        from kcal.report.map_page import check_map_format, save_map
 
         check_map_format(map_)
         check_writable(map_)
@@ -361,7 +346,14 @@ def locate_command(
                     err.print(note)
                 located = sample.located(locate)
                 true = None if truth is None else read_truth(truth, located)
-            draw_positions(located, true, picture, map_, tiles=tiles, image=image, online=online)
+            if picture is not None:
+                from kcal.report.figures import save_picture
+                from kcal.report.positions import positions_figure, stations_figure
+
+                draw = positions_figure if located.feet is None else stations_figure
+                save_picture(picture, draw(located, true))
+            if map_ is not None:
+                save_map(map_, located, true, tiles=tiles, image=image, online=online)
         except KeyboardInterrupt:
             kept = ", ".join(map(str, written)) or "nothing"
             err.print(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import typer
@@ -19,14 +21,58 @@ if TYPE_CHECKING:
     from kcal.lens.rig import Mounting
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TypedStands:
+    """How cameras stand, as it is typed.
+
+    Args:
+        site: Place of each camera; heights are above the WGS84 ellipsoid, ± along each axis, 1 m if not given.
+        heading: Azimuth of each camera's axis from true north.
+        pitch: Elevation of each camera's axis above the horizon.
+        roll: Of each camera, clockwise as seen from behind it; level within the pitch's ± if not given.
+    """
+
+    site: Several[kinds.Place] | None = None
+    heading: Several[kinds.MeasuredDegrees] | None = None
+    pitch: Several[kinds.MeasuredDegrees] | None = None
+    roll: Several[kinds.MeasuredDegrees] | None = None
+
+    def mountings(self, count: int) -> list[Mounting]:
+        """Of so many cameras.
+
+        Raises:
+            InputError: another number of values, or an angle without ±.
+        """
+        from kcal.locate.stations import stated_mounting
+
+        site, heading, pitch, roll = self.site or [], self.heading or [], self.pitch or [], self.roll
+        if roll is None:
+            roll = [WithSigma(0.0, one.sigma) for one in pitch]
+            err.print("roll: 0, known as well as the pitch; --roll states it")
+        typed: dict[str, Sequence[kinds.KnownPlace | WithSigma]]
+        typed = {"--site": site, "--heading": heading, "--pitch": pitch, "--roll": roll}
+        for option, given in typed.items():
+            if len(given) != count:
+                raise InputError(f"{option}: one value for each of {count} cameras is needed, got {len(given)}")
+            if vague := [one for one in given if one.sigma is None and option != "--site"]:
+                raise InputError(f"{option} {vague[0]}: say how well it is known, for example {vague[0]}±1")
+        return [
+            stated_mounting(
+                place.origin,
+                heading_deg=(turn.value, turn.sigma or 0.0),
+                pitch_deg=(rise.value, rise.sigma or 0.0),
+                roll_deg=(tip.value, tip.sigma or 0.0),
+                sigma_m=(1.0 if place.sigma is None else place.sigma,) * 3,
+            )
+            for place, turn, rise, tip in zip(site, heading, pitch, roll, strict=True)
+        ]
+
+
 def place_command(
     cameras: list[kinds.CalibratedCamera],
     *,
     output: kinds.Output,
-    site: Several[kinds.Place] | None = None,
-    heading: Several[kinds.MeasuredDegrees] | None = None,
-    pitch: Several[kinds.MeasuredDegrees] | None = None,
-    roll: Several[kinds.MeasuredDegrees] | None = None,
+    stands: TypedStands,
     places: kinds.Table | None = None,
 ) -> None:
     """Make a station, or a rig of several, from positions and angles that are known: no landmarks are needed.
@@ -44,27 +90,23 @@ def place_command(
     Args:
         cameras: Camera file of each; of one file and a table, each line of the table is a place of that camera.
         output: Rig file to write.
-        site: Place of each camera; heights are above the WGS84 ellipsoid, ± along each axis, 1 m if not given.
-        heading: Azimuth of each camera's axis from true north.
-        pitch: Elevation of each camera's axis above the horizon.
-        roll: Of each camera, clockwise as seen from behind it; level within the pitch's ± if not given.
         places: In place of these a table: name (of the camera), lat, lon, height, sigma, heading, heading_sigma, pitch,
             pitch_sigma, and if need be sigma_up, roll, roll_sigma.
     """
     check_writable(output, *cameras, *filter(None, [places]))
-    typed = {"--site": site, "--heading": heading, "--pitch": pitch}
-    if (places is None) == any(value is None for value in typed.values()) or (places and (roll or any(typed.values()))):
+    needed = (stands.site, stands.heading, stands.pitch)
+    if (places is None) == any(value is None for value in needed) or (places and (stands.roll or any(needed))):
         raise typer.BadParameter("give --site, --heading and --pitch of each camera, or all of them in --places")
     from kcal.io.rig_file import save_rig
     from kcal.locate.stations import read_stands, station_rig
 
     names = camera_names(cameras)
     if places is None:
-        stands = dict(zip(names, _typed_stands(len(names), site or [], heading or [], pitch or [], roll), strict=True))
+        poses = dict(zip(names, stands.mountings(len(names)), strict=True))
     else:
-        stands = read_stands(places, None if len(names) == 1 else names)
-    lenses = load_cameras(cameras * len(stands) if len(cameras) == 1 else cameras)
-    rig = station_rig(dict(zip(stands, lenses, strict=True)), [*stands.values()])
+        poses = read_stands(places, None if len(names) == 1 else names)
+    lenses = load_cameras(cameras * len(poses) if len(cameras) == 1 else cameras)
+    rig = station_rig(dict(zip(poses, lenses, strict=True)), [*poses.values()])
     save_rig(rig, output)
     print_stands(rig)
     print_wrote(output)
@@ -73,36 +115,3 @@ def place_command(
         "alone sees a point",
         markup=False,
     )
-
-
-def _typed_stands(
-    count: int,
-    site: list[kinds.KnownPlace],
-    heading: list[WithSigma],
-    pitch: list[WithSigma],
-    roll: list[WithSigma] | None,
-) -> list[Mounting]:
-    """How each camera stands, as it was typed."""
-    from kcal.locate.stations import stated_mounting
-
-    if roll is None:
-        roll = [WithSigma(0.0, one.sigma) for one in pitch]
-        err.print("roll: 0, known as well as the pitch; --roll states it")
-    angles = {"--heading": heading, "--pitch": pitch, "--roll": roll}
-    for option, many in (("--site", len(site)), *((option, len(given)) for option, given in angles.items())):
-        if many != count:
-            raise InputError(f"{option}: one value for each of {count} cameras is needed, got {many}")
-    for option, given in angles.items():
-        for one in given:
-            if one.sigma is None:
-                raise InputError(f"{option} {one}: say how well it is known, for example {one}±1")
-    return [
-        stated_mounting(
-            place.origin,
-            heading_deg=(turn.value, turn.sigma or 0.0),
-            pitch_deg=(rise.value, rise.sigma or 0.0),
-            roll_deg=(tip.value, tip.sigma or 0.0),
-            sigma_m=(1.0 if place.sigma is None else place.sigma,) * 3,
-        )
-        for place, turn, rise, tip in zip(site, heading, pitch, roll, strict=True)
-    ]

@@ -260,15 +260,20 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
     """
     import torch
 
+    from kcal.corners.images import expand_images, read_gray
     from kcal.locate.raster import terrain
-    from kcal.skyline.attitude import skyline_source
+    from kcal.skyline.attitude import SkylineImage, skyline_source
     from kcal.skyline.horizon import RasterError
 
     given, names = read.given, list(read.cameras)
     words = given.skyline or given.scene
     if not words:
         raise InputError("--terrain needs images of the skyline: --skyline IMAGES, or NAME=IMAGES for each camera")
-    images = _read_images(names, words)
+    images = [
+        SkylineImage(name=f"{name} {path.name}", camera=names.index(name), image=read_gray(path))
+        for name, own in images_by_camera("--skyline", words, names).items()
+        for path in expand_images(own)
+    ]
     places = {position.camera: position for position in read.positions}
     without = sorted({names[image.camera] for image in images if image.camera not in places})
     if read.origin is None or without:
@@ -298,17 +303,6 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
         for text in one.warnings:
             warn(f"skyline {image.name}: {text}")
     read.add("skyline", source)
-
-
-def _read_images(names: Sequence[str], words: Sequence[str]) -> list[SkylineImage]:
-    from kcal.corners.images import expand_images, read_gray
-    from kcal.skyline.attitude import SkylineImage
-
-    return [
-        SkylineImage(name=f"{name} {path.name}", camera=names.index(name), image=read_gray(path))
-        for name, given in images_by_camera("--skyline", words, names).items()
-        for path in expand_images(given)
-    ]
 
 
 def _lines(image: SkylineImage, names: Sequence[str], found: SkylineAttitude) -> list[str]:

@@ -210,15 +210,12 @@ def _by_stars(
 
 def sparse_parts(found: StarCamera, size: tuple[int, int]) -> list[str]:
     """Which parts of the image saw too few stars, and what to do."""
-    counts = [[0] * _PARTS for _ in range(_PARTS)]
-    for pixels in found.pixels:
-        for u, v in pixels.tolist():
-            counts[min(int(v / size[1] * _PARTS), _PARTS - 1)][min(int(u / size[0] * _PARTS), _PARTS - 1)] += 1
-    rows, columns = ("top", "middle", "bottom"), ("left", "center", "right")
-    empty = [
-        f"{row} {column}" for row, own in zip(rows, counts, strict=True) for column, n in zip(columns, own, strict=True)
-        if n < _FEW_IN_A_PART
-    ]  # fmt: skip
+    import numpy as np
+
+    column, row = (np.concatenate(found.pixels) / size * _PARTS).astype(int).clip(max=_PARTS - 1).T
+    counts = np.bincount(row * _PARTS + column, minlength=_PARTS**2).tolist()
+    parts = [f"{row} {column}" for row in ("top", "middle", "bottom") for column in ("left", "center", "right")]
+    empty = [part for part, count in zip(parts, counts, strict=True) if count < _FEW_IN_A_PART]
     if not empty:
         return []
     share = math.ceil(100 * len(empty) / _PARTS**2)
