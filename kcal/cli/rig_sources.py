@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from kcal.cli.console import aligned, err, steps, warn
 from kcal.cli.inputs import typed_with
 from kcal.cli.rig_options import Sources
-from kcal.cli.stars import sky_view
+from kcal.cli.stars import Night
 from kcal.errors import InputError, KcalError
 from kcal.texts import measured_text
 from kcal.values import named, with_sigma
@@ -226,13 +226,14 @@ def _named_images(side: str, given: list[str], read: RigReading) -> list[NamedSt
 
     files, night = expand_nights(given), read.given
     found: list[NamedStars] = []
-    # A place without a time tells nothing.
-    place = read.origin if night.time is not None else None
+    taken = Night(
+        time=night.time, dut1=night.dut1, temperature=night.temperature, pressure=night.pressure,
+        # A place without a time tells nothing.
+        site=None if night.time is None else read.origin,
+    )  # fmt: skip
     with steps(f"naming stars of {side}", len(files)) as advance:
         for path in files:
-            view = sky_view(
-                path, night.time, place, dut1=night.dut1, temperature=night.temperature, pressure=night.pressure
-            )
+            view = taken.view(path)
             try:
                 image = name_stars(read_night(path), read.cameras[side], view)
             except KcalError as error:

@@ -16,7 +16,7 @@ from kcal.files import check_writable
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
-    from kcal.lens.rig import Origin, Rig
+    from kcal.lens.rig import Rig
     from kcal.stars.detect import DetectedStars
     from kcal.stars.lens import StarCamera
     from kcal.stars.night import NamedStars, SkyView
@@ -26,25 +26,36 @@ if TYPE_CHECKING:
 # Night images as commands read them: when and where they were taken, and the lens that their stars tell.
 
 
-def sky_view(
-    path: Path,
-    time: str | None,
-    site: Origin | None,
-    *,
-    dut1: float | None = None,
-    time_sigma: float = 0.1,
-    temperature: float | None = None,
-    pressure: float | None = None,
-) -> SkyView:
-    """When and where an image was taken, from options of the command line."""
-    from kcal.stars.detect import time_of
-    from kcal.stars.night import SkyView
-    from kcal.stars.sky import Air
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Night:
+    """When and where night images were taken.
 
-    known = {} if temperature is None else {"celsius": temperature, "celsius_sigma": 1.0}
-    known |= {} if pressure is None else {"hectopascal": pressure, "hectopascal_sigma": 1.0}
-    air = None if site is None else Air.at_height(site.height, **known)
-    return SkyView(time=time_of(time, path), origin=site, air=air, dut1=dut1, time_sigma=time_sigma)
+    Args:
+        site: Where the camera stands: latitude, longitude, height above the WGS84 ellipsoid.
+        dut1: UT1 - UTC, if known; not known, it is 0 ± 0.52 s (8″).
+        time_sigma: Standard deviation of the camera's clock; 1 s is 15″.
+        temperature: Of the air, for refraction.
+        pressure: At the camera; standard air if not given.
+    """
+
+    time: kinds.Times | None = None
+    site: kinds.Site | None = None
+    dut1: kinds.Clock | None = None
+    time_sigma: kinds.Seconds = 0.1
+    temperature: kinds.Celsius | None = None
+    pressure: kinds.Hectopascal | None = None
+
+    def view(self, path: Path) -> SkyView:
+        """Of one image."""
+        from kcal.stars.detect import time_of
+        from kcal.stars.night import SkyView
+        from kcal.stars.sky import Air
+
+        known = {} if self.temperature is None else {"celsius": self.temperature, "celsius_sigma": 1.0}
+        known |= {} if self.pressure is None else {"hectopascal": self.pressure, "hectopascal_sigma": 1.0}
+        air = None if self.site is None else Air.at_height(self.site.height, **known)
+        time = time_of(self.time, path)
+        return SkyView(time=time, origin=self.site, air=air, dut1=self.dut1, time_sigma=self.time_sigma)
 
 
 def camera_by_stars(
@@ -181,7 +192,7 @@ def _by_stars(
         raise InputError("--site without --time tells nothing: refraction depends on both")
     files = expand_nights(images)
     check_writable(output, *files)
-    views = [sky_view(path, time, origin) for path in files]
+    views = [Night(time=time, site=origin).view(path) for path in files]
     found, size = camera_by_stars(files, views, "calibrating by stars", boards)
     count = sum(int(use.sum()) for use in found.lens.used)
     left_out = sum(len(use) for use in found.lens.used) - count
@@ -232,12 +243,7 @@ def stars_command(
     images: list[kinds.Images],
     *,
     camera: Annotated[str, Kind(metavar="CAMERA")] | None = None,
-    time: kinds.Times | None = None,
-    site: kinds.Site | None = None,
-    dut1: kinds.Clock | None = None,
-    time_sigma: kinds.Seconds = 0.1,
-    temperature: kinds.Celsius | None = None,
-    pressure: kinds.Hectopascal | None = None,
+    night: Night,
     picture: kinds.Picture | None = None,
 ) -> None:
     """Name the stars of night images, and find how the camera looks.
@@ -257,11 +263,6 @@ def stars_command(
         images: Night images of one camera: files, folders or quoted wildcards; PNG (8 or 16 bit), FITS, or a video
             whose frames are summed.
         camera: Camera file; FILE:left names one of a rig. Without one, the lens is found from the stars first.
-        site: Where the camera stands: latitude, longitude, height above the WGS84 ellipsoid.
-        dut1: UT1 - UTC, if known; not known, it is 0 ± 0.52 s (8″).
-        time_sigma: Standard deviation of the camera's clock; 1 s is 15″.
-        temperature: Of the air, for refraction.
-        pressure: At the camera; standard air if not given.
         picture: the first image that has names, with them.
     """
     from kcal.stars.detect import expand_nights, read_night
@@ -271,10 +272,7 @@ def stars_command(
     files = expand_nights(images)
     if picture is not None:
         check_writable(picture, *files)
-    views = [
-        sky_view(path, time, site, dut1=dut1, time_sigma=time_sigma, temperature=temperature, pressure=pressure)
-        for path in files
-    ]
+    views = [night.view(path) for path in files]
     catalog = StarCatalog.bundled()
     lens = single_camera(camera) if camera else camera_by_stars(files, views, "finding the lens")[0].lens.camera
     told: list[dict[str, Any]] = []
@@ -306,7 +304,7 @@ def stars_command(
     if len(rows) == 1:
         raise InputError(f"in none of {len(files)} images stars have names")
     print_table(rows)
-    if views[0].on_earth and dut1 is None:
+    if views[0].on_earth and night.dut1 is None:
         out.print("UT1 - UTC is not known (--dut1): it is part of the σ about the Earth's axis with 8″")
     print_wrote(picture)
 
