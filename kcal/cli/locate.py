@@ -309,12 +309,12 @@ def locate_command(
         raise typer.BadParameter("-o - takes the standard output for itself; leave out --json and a second -o -")
     if streamed:
         console.end_line()
+    named = [f"positions{suffix}" if path == STREAM else path for path in outputs]
+    for name in named:
+        check_format(name)
     for path in outputs:
-        if path == STREAM:
-            check_format(f"positions{suffix}")
-            continue
-        check_format(path)
-        check_writable(path, rig, points, *([truth] if truth else []))
+        if path != STREAM:
+            check_writable(path, rig, points, *filter(None, [truth]))
     if map_ is not None:
         from kcal.report.map_page import check_map_format, save_map
 
@@ -322,8 +322,8 @@ def locate_command(
         check_writable(map_)
     locate, parts, note = locate_run(rig, points, options)
     empty = locate.located()
-    for path in outputs:
-        check_place(f"positions{suffix}" if path == STREAM else path, empty)
+    for name in named:
+        check_place(name, empty)
     if not empty.origin:
         for option, given in (("--map", map_), ("--picture", picture), ("--truth", truth)):
             if given is not None:

@@ -223,11 +223,9 @@ def replace_rig(path: Path, new: Rig) -> None:
 
     # The old one first: whatever happens in between, there is a good rig.
     if path.exists():
-        names = (
-            f"{path.stem}.before-{now_stamp()}{more}{path.suffix}"
-            for more in itertools.chain([""], itertools.count(-2, -1))
-        )
-        kept = next(found for found in map(path.with_name, names) if not found.exists())
+        numbers = itertools.chain([""], itertools.count(-2, -1))
+        names = (path.with_name(f"{path.stem}.before-{now_stamp()}{more}{path.suffix}") for more in numbers)
+        kept = next(name for name in names if not name.exists())
         write_atomic(kept, path.read_bytes())
         out.print(f"kept the old rig as {kept}", markup=False)
     save_rig(new, path)
