@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
@@ -24,7 +25,7 @@ from kcal.cli.console import (
 )
 from kcal.cli.inputs import BOARD, calibrated_camera, check_file, pixel_sigma_of
 from kcal.cli.options import Kind, Rare, Several
-from kcal.cli.report import NO, judged, required, told_usable
+from kcal.cli.report import NO, judged, told_usable
 from kcal.cli.stars import by_night, joined_by_stars
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_picture, check_writable, make_folder
@@ -33,8 +34,10 @@ from kcal.texts import measured_text, number_text, percent_text
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
 
+_T = TypeVar("_T")
 
-# How the setting of a lens is typed: NAME=NUMBER, of several cameras NAME=NUMBER,NUMBER,...
+
+# Options that name something and say a number of it; each name once.
 
 
 def option_number(text: str, option: str) -> float:
@@ -45,26 +48,41 @@ def option_number(text: str, option: str) -> float:
         raise InputError(f"{option}: {text.strip()!r} is not a number") from None
 
 
-def named_numbers(texts: list[str] | None, option: str) -> dict[str, list[float]]:
-    """Parse NAME=NUMBER[,NUMBER...] of an option that may be repeated."""
-    found: dict[str, list[float]] = {}
+def by_name(texts: list[str] | None, option: str, read: Callable[[str | None, str], _T], twice: str) -> dict[str, _T]:
+    """What an option that may be repeated, `NAME=TEXT`, says of each name: `read` of the text and of what was typed."""
+    found: dict[str, _T] = {}
     for text in texts or []:
-        name, equals, values = (part.strip() for part in text.partition("="))
-        if not name or not equals:
-            raise InputError(f"{option} {text}: write NAME=NUMBER, for example focus=3.2")
+        name, equals, value = (part.strip() for part in text.partition("="))
         if name in found:
-            raise InputError(f"{option} {text}: {name} is stated twice")
-        found[name] = [option_number(value, f"{option} {text}") for value in values.split(",")]
+            raise InputError(f"{option} {text}: {name} {twice}")
+        found[name] = read(value if name and equals else None, f"{option} {text}")
     return found
 
 
 def stated_settings(texts: list[str] | None, count: int) -> list[dict[str, float]]:
     """The setting of each of some cameras, by `--setting`; empty if not given."""
-    found = named_numbers(texts, "--setting")
+
+    def numbers(text: str | None, option: str) -> list[float]:
+        if text is None:
+            raise InputError(f"{option}: write NAME=NUMBER, for example focus=3.2")
+        return [option_number(value, option) for value in text.split(",")]
+
+    found = by_name(texts, "--setting", numbers, "is stated twice")
     for name, values in found.items():
         if len(values) not in (1, count):
             raise InputError(f"--setting {name}: {len(values)} numbers for {count} cameras; give one, or one for each")
     return [{name: values[i % len(values)] for name, values in found.items()} for i in range(count)]
+
+
+def _fixed(text: str | None, option: str) -> float | None:
+    return None if text is None else option_number(text, option)
+
+
+def _prior(text: str | None, option: str) -> tuple[float, float]:
+    mean, sign, sigma = (text or "").replace("+-", "±").partition("±")
+    if not sign:
+        raise InputError(f"{option}: write NAME=VALUE±SIGMA, for example fx=1600±5")
+    return option_number(mean, option), option_number(sigma, option)
 
 
 # What `kcal calibrate` tells of a calibration: to persons, and to programs.
@@ -163,7 +181,6 @@ def _parameters(result: CameraCalibrationResult) -> list[list[str]]:
 
 
 _USE = "May it be used?"
-_T = TypeVar("_T")
 _Parametric = Annotated[_T, Kind(rare=True, panel="Options of parametric models")]
 
 
@@ -185,7 +202,7 @@ def calibrate_command(
     setting: Annotated[list[str] | None, Kind(metavar="NAME=NUMBER")] = None,
     name: Rare[str] = "",
     model: Annotated[str, Kind(metavar="NAME")] = "hybrid",
-    require: Annotated[str, Kind(metavar="RANGE:ERROR", panel=_USE)] = "",
+    require: Annotated[kinds.Needs | None, Kind(panel=_USE)] = None,
     report: Annotated[Path | None, Kind(panel=_USE)] = None,
     baseline: Rare[Annotated[float, Kind(metavar="M", least=1e-3, panel=_USE)]] = 10.0,
     pixel_sigma: kinds.PixelSigma | None = None,
@@ -273,7 +290,7 @@ def calibrate_command(
         return
     if stars and len(obs) > 1:
         raise InputError("--stars are of one camera: calibrate each with its own boards and night images")
-    needs = required(require)
+    needs = require or ()
     if board_shape not in ("printed", "exact"):
         check_file("--board-shape", board_shape, BOARD)
     places = _camera_files(obs, output, picture, report, name)
@@ -302,10 +319,10 @@ def calibrate_command(
         board_warp=board_warp,
         focal=focal,
         field_of_view=fov,
-        fixed=_fixed(fix or []),
+        fixed=by_name(fix, "--fix", _fixed, "is fixed twice"),
         tied=tuple(tuple(name.strip() for name in text.split("=")) for text in tie or []),
         free=tuple(free or []),
-        priors=_priors(prior or []),
+        priors=by_name(prior, "--prior", _prior, "has a prior already"),
         weak_prior=weak_prior or None,
         camera=known,
         loss=None if loss is None else RobustLoss(kind=loss, scale=loss_scale),  # type: ignore[arg-type]
@@ -410,28 +427,3 @@ def _camera_files(
         if place.picture is not None:
             check_picture(place.picture)
     return places
-
-
-def _fixed(texts: list[str]) -> dict[str, float | None]:
-    """Parse `--fix` NAME or NAME=VALUE."""
-    found: dict[str, float | None] = {}
-    for text in texts:
-        name, equals, value = (part.strip() for part in text.partition("="))
-        if name in found:
-            raise InputError(f"--fix {text}: {name} is fixed twice")
-        found[name] = option_number(value, f"--fix {text}") if equals else None
-    return found
-
-
-def _priors(texts: list[str]) -> dict[str, tuple[float, float]]:
-    """Parse `--prior` NAME=VALUE±SIGMA."""
-    found: dict[str, tuple[float, float]] = {}
-    for text in texts:
-        name, equals, rest = (part.strip() for part in text.partition("="))
-        mean, sign, sigma = rest.replace("+-", "±").partition("±")
-        if not equals or not sign:
-            raise InputError(f"--prior {text}: write NAME=VALUE±SIGMA, for example fx=1600±5")
-        if name in found:
-            raise InputError(f"--prior {text}: {name} has a prior already")
-        found[name] = option_number(mean, f"--prior {text}"), option_number(sigma, f"--prior {text}")
-    return found

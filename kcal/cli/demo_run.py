@@ -9,18 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-import typer
 from rich.markup import escape
-from typer.main import get_command
+from typer.main import get_group
 
 from kcal.calibrate.rig.pairs import pair_by_name
-from kcal.cli.calibrate import calibrate_command
 from kcal.cli.console import err, out, print_table, steps
-from kcal.cli.detect import detect_command
-from kcal.cli.locate import locate_command
-from kcal.cli.options import Command, declared
-from kcal.cli.report import report_command
-from kcal.cli.rig import app as rig
+from kcal.cli.main import app
 from kcal.corners.board import Board
 from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
@@ -181,20 +175,10 @@ SIDES = ("left", "right")
 
 
 def run(name: str, *arguments: object) -> None:
-    """Print a command as a user would type it, and run it: detect, calibrate, rig, locate or report."""
+    """Print a command as a user would type it, and run it, without what kcal.toml says."""
     words = [str(argument) for argument in arguments]
     out.print(f"\n[bold]kcal {escape(shlex.join([name, *words]))}[/]")
-    app = rig
-    if name != "rig":
-        app = typer.Typer()
-        commands = {
-            "detect": detect_command,
-            "calibrate": calibrate_command,
-            "locate": locate_command,
-            "report": report_command,
-        }
-        app.command(cls=Command)(declared(commands[name]))  # type: ignore[arg-type]
-    get_command(app).main(words, standalone_mode=False)
+    get_group(app).commands[name].main(words, standalone_mode=False)
 
 
 def locate_again(output: Path, *options: object) -> str:

@@ -7,9 +7,10 @@ import hashlib
 import io
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from rich.markup import escape
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from kcal.lens.images import StereoRectification, Undistort
     from kcal.lens.rig import Rig
 
+
+_T = TypeVar("_T")
 
 # Images of one camera, resampled into a folder: image by image, so that a run that was interrupted continues.
 
@@ -51,60 +54,21 @@ def targets_of(paths: list[Path], folder: Path, others: list[Path]) -> list[Path
     return targets
 
 
-def prepare(folder: Path, files: list[Path]) -> None:
-    """Make the folder, and refuse now what could not be written later."""
-    make_folder(folder)
-    for path in [*files, folder / IMAGE_JOURNAL]:
-        check_writable(path)
+def _done_before(journal: Path, view: str) -> dict[str, list[int]]:
+    """The files of which a view made images, as they were then: nothing is done that another view made."""
+    try:
+        content: Any = read_json(read_bytes(journal), str(journal)) if journal.exists() else {}
+    except FileError:
+        content = {}
+    fits = isinstance(content, dict) and content.get("view") == view and isinstance(content.get("done"), dict)
+    return content["done"] if fits else {}
 
 
-class ImageJournal:
-    """Which images of a folder are done, by which views: nothing is taken for done that another view made.
-
-    Args:
-        folder: of the images.
-        module: that makes them.
-    """
-
-    def __init__(self, folder: Path, module: Undistort) -> None:
-        values = [value.tolist() for value in (module.camera.params, module.new_camera.params, module.rotation)]
-        kinds = repr((type(module.new_camera).__name__, str(module.camera.model), module.camera.model.hybrid))
-        text = repr((values, kinds, module.camera.size, module.new_camera.size, module.at))
-        self.path = folder / IMAGE_JOURNAL
-        self.view = hashlib.sha256(text.encode()).hexdigest()[:16]
-        self.done: dict[str, list[int]] = {}
-        self._saved = time.monotonic()
-        try:
-            content: Any = read_json(read_bytes(self.path), str(self.path)) if self.path.exists() else {}
-        except FileError:
-            content = {}
-        if isinstance(content, dict) and content.get("view") == self.view and isinstance(content.get("done"), dict):
-            self.done = content["done"]
-        else:
-            # Before the first image: a run that is killed must not leave images that an older journal calls done.
-            self.save()
-
-    def has(self, path: Path, target: Path) -> bool:
-        """Whether this image was made of this file, as it is now."""
-        return target.exists() and self.done.get(target.name) == _file_state(path)
-
-    def add(self, path: Path, target: Path) -> None:
-        """Note that an image is done."""
-        self.done[target.name] = _file_state(path)
-        if time.monotonic() - self._saved > _OFTEN:
-            self.save()
-
-    def save(self) -> None:
-        """Write the journal."""
-        write_atomic(self.path, dump_json({"view": self.view, "done": self.done}))
-        self._saved = time.monotonic()
-
-    def close(self) -> None:
-        """Write the journal; where no image could be made, none is left."""
-        if self.done:
-            self.save()
-        else:
-            self.path.unlink(missing_ok=True)
+def _view_key(module: Undistort) -> str:
+    values = [value.tolist() for value in (module.camera.params, module.new_camera.params, module.rotation)]
+    kinds = repr((type(module.new_camera).__name__, str(module.camera.model), module.camera.model.hybrid))
+    text = repr((values, kinds, module.camera.size, module.new_camera.size, module.at))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _file_state(path: Path) -> list[int]:
@@ -120,23 +84,37 @@ def convert_images(
     Returns:
         how many were done before, and what was wrong with those that failed.
     """
-    journal = ImageJournal(targets[0].parent, module)
+    journal, view = targets[0].parent / IMAGE_JOURNAL, _view_key(module)
+    done = _done_before(journal, view)
+
+    def save() -> float:
+        write_atomic(journal, dump_json({"view": view, "done": done}))
+        return time.monotonic()
+
+    # Before the first image: a run that is killed must not leave images that an older journal calls done.
+    saved = save()
     failures: list[str] = []
     before = 0
     try:
         for path, target in zip(paths, targets, strict=True):
-            if journal.has(path, target):
+            if target.exists() and done.get(target.name) == _file_state(path):
                 before += 1
             else:
                 try:
                     _convert(path, target, module)
-                    journal.add(path, target)
+                    done[target.name] = _file_state(path)
                 except (FileError, InputError) as error:
                     failures.append(str(error))
                     err.print(f"[yellow]failed[/] {escape(str(error))}")
+            if time.monotonic() - saved > _OFTEN:
+                saved = save()
             advance(path.name)
     finally:
-        journal.close()
+        # Where no image could be made, no journal is left.
+        if done:
+            save()
+        else:
+            journal.unlink(missing_ok=True)
     return before, failures
 
 
@@ -236,6 +214,44 @@ def rig_of(source: str) -> Rig | None:
     return cameras_and_rig(path)[1] if name is None else None
 
 
+@contextmanager
+def _resampled(
+    folder: Path, images: dict[Path, list[Path]], extras: list[Path], make: Callable[[], tuple[_T, list[Undistort]]]
+) -> Iterator[tuple[_T, list[Undistort]]]:
+    """Resample the images of each camera, and say it; meanwhile the other files are written. Fail last.
+
+    Args:
+        folder: of the extras.
+        images: folder of a camera's new images -> the images of this camera.
+        extras: other files that will be written.
+        make: makes the view, and what resamples each camera's images; this takes a moment.
+    """
+    targets = {place: targets_of(paths, place, extras) for place, paths in images.items()}
+    # What could not be written later is refused now.
+    for place, files in [(folder, extras), *targets.items()]:
+        make_folder(place)
+        for path in [*files, place / IMAGE_JOURNAL]:
+            check_writable(path)
+    count = sum(map(len, images.values()))
+    before, failures = 0, list[str]()
+    with steps("rectifying", 1 + count) as advance:
+        made, modules = make()
+        advance("maps")
+        for (place, paths), module in zip(images.items(), modules, strict=False):
+            done, wrong = convert_images(paths, targets[place], module, advance)
+            before, failures = before + done, failures + wrong
+    if count and len(failures) == count:
+        raise FileError(f"none of {count} images could be resampled: {failures[0]}")
+    if count:
+        more = f" ({before} of them before)" if before else ""
+        width, height = modules[0].new_camera.size
+        out.print(f"{count - len(failures)} of {count} images rectified{more}, {width}x{height} px")
+    yield made, modules
+    print_wrote(folder, *extras)
+    if failures:
+        raise FileError(f"{len(failures)} of {count} images could not be resampled: {failures[0]}")
+
+
 def _rectify_camera(source: str, images: list[str], folder: Path, options: ViewOptions) -> None:
     from kcal.corners.images import expand_images
 
@@ -244,42 +260,37 @@ def _rectify_camera(source: str, images: list[str], folder: Path, options: ViewO
     look = options.pan, options.tilt
     if any(look) and options.fov is None:
         raise InputError("--pan and --tilt need --fov: which part of the image is to be shown")
-    paths = expand_images(images) if images else []
+    sides = {folder: expand_images(images)} if images else {}
     path, part = named_source(source)
     name = part or path.name.removesuffix(".json").removesuffix(".camera")
     camera_path = folder / f"{name}_rectified.json"
     extras = [*([] if options.cylinder else [camera_path]), *_extra_paths(folder, name, options)]
-    targets = targets_of(paths, folder, extras)
 
     from kcal.io.camera_file import save_camera
     from kcal.lens.images import Undistort
     from kcal.lens.views import cylinder_view, looking, new_pinhole, pinhole_view
 
     old = single_camera(source)
-    prepare(folder, [*targets, *extras])
-    with steps("rectifying", 1 + len(paths)) as advance:
+
+    def make() -> tuple[Any, list[Undistort]]:
         fov, size = options.fov, options.size
         if options.cylinder:
             view: Any = cylinder_view(old, fov, size)
         else:
             view = new_pinhole(old, options.alpha, size) if fov is None else pinhole_view(fov, size or old.size)
-        module = Undistort(old, view, looking(*look) if any(look) else None, at=options.distance)
-        advance("maps")
-        before, failures = convert_images(paths, targets, module, advance) if paths else (0, [])
-    _refuse_none(paths, failures)
-    if not options.cylinder:
-        save_camera(view, camera_path, name=f"{name} rectified")
-    _write_extras(folder, name, module, options)
-    _tell_images(len(paths), before, failures, view.size)
-    if options.cylinder:
-        focal, cx, cy = view.params.tolist()
-        out.print(f"cylinder: {focal:.2f} px a radian; straight ahead is {cx:.2f}, {cy:.2f}")
-    else:
-        fx, fy, cx, cy = view.params[:4].tolist()
-        out.print(f"new camera: fx {fx:.2f}, fy {fy:.2f}, cx {cx:.2f}, cy {cy:.2f}")
-    _tell_view(old, module, "")
-    print_wrote(folder, *extras)
-    _fail_at_end(paths, failures)
+        return view, [Undistort(old, view, looking(*look) if any(look) else None, at=options.distance)]
+
+    with _resampled(folder, sides, extras, make) as (view, (module,)):
+        if not options.cylinder:
+            save_camera(view, camera_path, name=f"{name} rectified")
+        _write_extras(folder, name, module, options)
+        if options.cylinder:
+            focal, cx, cy = view.params.tolist()
+            out.print(f"cylinder: {focal:.2f} px a radian; straight ahead is {cx:.2f}, {cy:.2f}")
+        else:
+            fx, fy, cx, cy = view.params[:4].tolist()
+            out.print(f"new camera: fx {fx:.2f}, fy {fy:.2f}, cx {cx:.2f}, cy {cy:.2f}")
+        _tell_view(old, module, "")
 
 
 def _rectify_rig(rig: Rig, images: list[str], folder: Path, options: ViewOptions) -> None:
@@ -289,10 +300,9 @@ def _rectify_rig(rig: Rig, images: list[str], folder: Path, options: ViewOptions
         got = f"got {len(images)}" if images else "or --maps for the maps alone"
         raise InputError(f"a rig needs LEFT and RIGHT: two files, folders or quoted wildcards, {got}")
     names = ("left", "right")
-    sides = {name: expand_images([given]) for name, given in zip(names, images, strict=False)}
+    sides = {folder / name: expand_images([given]) for name, given in zip(names, images, strict=False)}
     rig_path, matrix_path = folder / "rectified.rig.json", folder / "Q.npy"
     extras = [rig_path, matrix_path, *(path for name in names for path in _extra_paths(folder, name, options))]
-    targets = {name: targets_of(paths, folder / name, []) for name, paths in sides.items()}
 
     import torch
 
@@ -300,34 +310,22 @@ def _rectify_rig(rig: Rig, images: list[str], folder: Path, options: ViewOptions
     from kcal.lens.images import StereoRectification
     from kcal.lens.rig import Rig
 
-    prepare(folder, extras)
-    for name, files in targets.items():
-        prepare(folder / name, files)
-    before, failures = 0, list[str]()
-    with steps("rectifying", 1 + sum(map(len, sides.values()))) as advance:
-        module = StereoRectification(
+    def make() -> tuple[StereoRectification, list[Undistort]]:
+        made = StereoRectification(
             rig, alpha=options.alpha, size=options.size, field_of_view=options.fov, at=options.distance
         )
-        advance("maps")
-        for name, side in zip(names, (module.left, module.right), strict=True):
-            if name in sides:
-                done, wrong = convert_images(sides[name], targets[name], side, advance)
-                before, failures = before + done, failures + wrong
-    paths = [path for some in sides.values() for path in some]
-    _refuse_none(paths, failures)
-    save_rig(Rig.pair(module.camera, module.camera, torch.eye(3), -module.right_center), rig_path)
-    _save_array(matrix_path, module.depth_matrix)
-    for name, side in zip(names, (module.left, module.right), strict=True):
-        _write_extras(folder, name, side, options)
-    _tell_images(len(paths), before, failures, module.camera.size)
-    focal, _, cx, cy = module.camera.params[:4].tolist()
-    out.print(f"both cameras: focal length {focal:.2f} px, cx {cx:.2f}, cy {cy:.2f}, baseline {rig.baseline:.6g} m")
-    for name, side in zip(names, (module.left, module.right), strict=True):
-        _tell_view(side.camera, side, f"{name}: ")
-    _tell_side(module)
-    _tell_ranges(module)
-    print_wrote(folder, *extras)
-    _fail_at_end(paths, failures)
+        return made, [made.left, made.right]
+
+    with _resampled(folder, sides, extras, make) as (both, modules):
+        save_rig(Rig.pair(both.camera, both.camera, torch.eye(3), -both.right_center), rig_path)
+        _save_array(matrix_path, both.depth_matrix)
+        focal, _, cx, cy = both.camera.params[:4].tolist()
+        out.print(f"both cameras: focal length {focal:.2f} px, cx {cx:.2f}, cy {cy:.2f}, baseline {rig.baseline:.6g} m")
+        for name, side in zip(names, modules, strict=True):
+            _write_extras(folder, name, side, options)
+            _tell_view(side.camera, side, f"{name}: ")
+        _tell_side(both)
+        _tell_ranges(both)
 
 
 def _extra_paths(folder: Path, name: str, options: ViewOptions) -> list[Path]:
@@ -356,12 +354,6 @@ def _save_array(path: Path, values: Any) -> None:
     data = io.BytesIO()
     np.save(data, values.contiguous().numpy(), allow_pickle=False)
     write_atomic(path, data.getvalue())
-
-
-def _tell_images(count: int, before: int, failures: list[str], size: tuple[int, int]) -> None:
-    if count:
-        more = f" ({before} of them before)" if before else ""
-        out.print(f"{count - len(failures)} of {count} images rectified{more}, {size[0]}x{size[1]} px")
 
 
 def _tell_view(camera: Camera, module: Undistort, label: str) -> None:
@@ -433,16 +425,6 @@ def _tell_ranges(module: StereoRectification) -> None:
     print_table(rows)
     if module.rig.covariance is None:
         warn("the rig has no error bars: sigmas are those of the disparities alone")
-
-
-def _refuse_none(paths: list[Path], failures: list[str]) -> None:
-    if paths and len(failures) == len(paths):
-        raise FileError(f"none of {len(paths)} images could be resampled: {failures[0]}")
-
-
-def _fail_at_end(paths: list[Path], failures: list[str]) -> None:
-    if failures:
-        raise FileError(f"{len(failures)} of {len(paths)} images could not be resampled: {failures[0]}")
 
 
 # `kcal rays`: the ray of every pixel, for renderers such as gsplat.

@@ -79,15 +79,6 @@ def report_command(
         raise typer.Exit(NO)
 
 
-def required(text: str) -> tuple[Requirement, ...]:
-    """What was asked for with --require."""
-    if not text:
-        return ()
-    from kcal.report.verdict import Requirement
-
-    return Requirement.parse(text)
-
-
 def told_usable(
     verdict: Verdict,
     pictures: Callable[[], dict[str, bytes]],
