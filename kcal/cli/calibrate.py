@@ -88,8 +88,11 @@ def _prior(text: str | None, option: str) -> tuple[float, float]:
 # What `kcal calibrate` tells of a calibration: to persons, and to programs.
 
 
-def print_calibration(result: CameraCalibrationResult, beside: Path, *, reject: bool, verbose: bool) -> None:
-    """Print what a person reads; a long list of what was left out goes to a file beside the camera's."""
+def told_calibration(result: CameraCalibrationResult, beside: Path, *, reject: bool, verbose: bool) -> dict[str, Any]:
+    """Print what a person reads, and return what programs want to know.
+
+    A long list of what was left out goes to a file beside the camera's.
+    """
     from kcal.calibrate.camera.trust import distances_text, summarize
 
     assert result.camera.calibration is not None
@@ -138,13 +141,6 @@ def print_calibration(result: CameraCalibrationResult, beside: Path, *, reject: 
         warn(text)
     for text in result.advice:
         out.print(f"next: {text}", markup=False)
-
-
-def calibration_numbers(result: CameraCalibrationResult) -> dict[str, Any]:
-    """What programs want to know of a calibration."""
-    from kcal.calibrate.camera.trust import summarize
-
-    brief = summarize(result)
     return dict(
         rms_px=result.rms,
         noise_px=result.noise,
@@ -360,18 +356,19 @@ def calibrate_command(
             from kcal.report.figures import save_picture
 
             save_picture(place.picture, calibration_figure(result, place.name))
-        print_calibration(result, place.output, reject=reject, verbose=verbose or not options.hybrid)
+        figures[place.name] = told_calibration(
+            result, place.output, reject=reject, verbose=verbose or not options.hybrid
+        )
         if result.shared_board is not None:
             others = ", ".join(places[i].name for i in result.shared_board.others)
             out.print(f"the board is that of {others} (evidence {result.shared_board.evidence:.0f} nats)", markup=False)
         print_wrote(place.output, place.picture)
-        figures[place.name] = calibration_numbers(result)
         if needs or place.report is not None:
             found = judged(
                 result, options, needs, baseline=baseline, mark_sigma=pixel_sigma_of(pixel_sigma), name=place.name
             )
             figures[place.name]["verdict"] = found[0].to_dict()
-            usable = told_usable(*found, place.report, warned=result.findings) and usable
+            usable = told_usable(found, place.report, result.findings) and usable
     tell(cameras=figures)
     if failed:
         raise DegenerateError(f"{len(failed)} of {len(places)} cameras failed: {', '.join(failed)}")
@@ -393,37 +390,29 @@ def _camera_files(
     observations: list[Path], output: Path, picture: Path | None, report: Path | None, name: str
 ) -> list[_CameraFiles]:
     """Files of each camera, all of which can be written."""
-    if len(observations) == 1:
-        places = [_CameraFiles(observations[0], output, picture, report, name or observations[0].name.split(".")[0])]
-    else:
-        if name:
-            raise InputError("--name names one camera; several are named after their observations files")
-        names = [path.name.split(".")[0] for path in observations]
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            same = [path for path in observations if path.name.split(".")[0] == twice]
-            copy = same[1].with_name(f"{same[1].parent.name or 'other'}-{same[1].name}")
+    several = len(observations) > 1
+    if several and name:
+        raise InputError("--name names one camera; several are named after their observations files")
+    names = [name or path.name.split(".")[0] for path in observations]
+    for twice in names:
+        first, *others = [path for path, own in zip(observations, names, strict=True) if own == twice]
+        if others:
+            copy = others[0].with_name(f"{others[0].parent.name or 'other'}-{others[0].name}")
             raise InputError(
-                f"{same[0]} and {same[1]} are both named {twice}: their cameras would overwrite each other. "
-                f"To tell them apart: {shlex.join(['mv', str(same[1]), str(copy)])}"
+                f"{first} and {others[0]} are both named {twice}: their cameras would overwrite each other. "
+                f"To tell them apart: {shlex.join(['mv', str(others[0]), str(copy)])}"
             )
-        for folder in (output, picture, report):
-            if folder is not None:
+    places = []
+    for path, own in zip(observations, names, strict=True):
+        files = output, picture, report
+        if several:
+            for folder in filter(None, files):
                 make_folder(folder)
-        places = [
-            _CameraFiles(
-                path,
-                output / f"{name}.camera.json",
-                picture and picture / f"{name}.png",
-                report and report / f"{name}.html",
-                name,
-            )
-            for path, name in zip(observations, names, strict=True)
-        ]
+            files = output / f"{own}.camera.json", picture and picture / f"{own}.png", report and report / f"{own}.html"
+        places.append(_CameraFiles(path, *files, own))
     for place in places:
-        check_writable(place.output, *observations)
-        if place.report is not None:
-            check_writable(place.report, *observations)
+        for file in filter(None, (place.output, place.report)):
+            check_writable(file, *observations)
         if place.picture is not None:
             check_picture(place.picture)
     return places

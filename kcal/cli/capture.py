@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from kcal.cli import kinds
@@ -17,7 +16,6 @@ from kcal.files import check_writable
 
 if TYPE_CHECKING:
     from kcal.capture.session import CaptureSession
-    from kcal.corners.board import Board
     from kcal.web.serving import LocalServer
 
 _PORT = 8348
@@ -62,7 +60,12 @@ def capture_command(
     from kcal.capture.session import CaptureOptions, CaptureSession, follow, shots
 
     check_writable(output)
-    pattern = given_board(board, square) or _known_board(source, square, output)
+    pattern = given_board(board, square)
+    if pattern is None and output.exists():
+        from kcal.corners.observations import Observations
+
+        pattern = Observations.load(output).board
+    pattern = pattern or board_in_images([source], square)
     session = CaptureSession(output, pattern, CaptureOptions(until=until, most=most, refine=refine.value))
     if session.views:
         err.print(f"{output} has {session.views} views; going on", markup=False)
@@ -119,15 +122,6 @@ def capture_command(
     out.print(f"wrote {output} and {session.views} frames in {session.frames}", markup=False)
     camera = f"{output.name.split('.')[0]}.camera.json"
     out.print(f"next: kcal calibrate {output} -o {output.with_name(camera)}", markup=False, soft_wrap=True)
-
-
-def _known_board(source: str, square: str | None, output: Path) -> Board:
-    """The board of the file that is continued, or the one that is shown to the camera now."""
-    if output.exists():
-        from kcal.corners.observations import Observations
-
-        return Observations.load(output).board
-    return board_in_images([source], square)
 
 
 def _stop_server(threads: list[threading.Thread], server: LocalServer) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import math
 import time
@@ -10,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import err, out, print_answer, print_wrote, steps, tell, tell_table, warn
 from kcal.cli.options import Kind, Several
-from kcal.cli.report import NO
+from kcal.cli.report import NO, calibrated_again
 from kcal.cli.rig_sources import check_views_of
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, read_bytes, write_atomic
@@ -22,7 +24,6 @@ from kcal.table import Table
 if TYPE_CHECKING:
     from kcal.calibrate.camera.interval_check import IntervalCheck, Refit
     from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
-    from kcal.lens.camera import Camera
 
 # Exit code of a run that was interrupted, as in all commands.
 _INTERRUPTED = 130
@@ -104,9 +105,6 @@ def check_command(
 
 def _calibration_of(path: Path, observations: Path | None) -> tuple[CameraCalibrationResult, CalibrationOptions, str]:
     """The calibration, with residuals and poses, which a camera file does not have; and the file's fingerprint."""
-    from kcal.calibrate.camera.calibrate import calibrate_camera
-    from kcal.calibrate.camera.trust import stored_options
-    from kcal.corners.observations import Observations
     from kcal.io.camera_file import load_camera
     from kcal.report.judge_camera import other_views
 
@@ -115,24 +113,17 @@ def _calibration_of(path: Path, observations: Path | None) -> tuple[CameraCalibr
         raise InputError(
             f"{path}: the camera has no error bars that could be checked; calibrate it with kcal calibrate"
         )
-    file = observations or _observations_beside(path, camera)
-    seen, options = Observations.load(file), stored_options(camera)
-    check_views_of([camera], [seen], [file])
-    with steps("calibrating", None) as advance:
-        result = calibrate_camera(seen, options, advance)
+    record = camera.calibration.record
+    name = record.observations if record else None
+    file = observations or path.parent / Path(name or "").name
+    if observations is None and not (name and file.exists()):
+        wanted = f" ({name})" if name else ""
+        raise InputError(f"{path}: its observations{wanted} are not beside it; name them with --observations")
+    result, options = calibrated_again(camera, file, "calibrating")
     others, _ = other_views(camera, result)
     if others:
         raise InputError(f"{file}: {others[0].sentence}")
     return result, options, camera.fingerprint
-
-
-def _observations_beside(path: Path, camera: Camera) -> Path:
-    record = camera.calibration.record if camera.calibration else None
-    name = record.observations if record else None
-    if name is None or not path.with_name(Path(name).name).exists():
-        wanted = f" ({name})" if name else ""
-        raise InputError(f"{path}: its observations{wanted} are not beside it; name them with --observations")
-    return path.with_name(Path(name).name)
 
 
 def _all_refits(
@@ -147,7 +138,8 @@ def _all_refits(
     from kcal.calibrate.camera.interval_check import GRID, simulated_refits
 
     # That of the file: a calibration that is made again differs in the last digits.
-    key = repr((fingerprint, [view.pixels for view in result.observations.views], ranges, GRID))
+    text = repr((fingerprint, [view.pixels for view in result.observations.views], ranges, GRID))
+    key = hashlib.sha256(f"{kcal.__version__}{text}".encode()).hexdigest()[:16]
     done = _kept_refits(path, key)[:count]
     if done:
         out.print(f"{len(done)} refits are done already ({path})", markup=False)
@@ -170,20 +162,12 @@ def _all_refits(
     return done, whole
 
 
-def _run_digest(key: str) -> str:
-    import hashlib
-
-    from kcal import __version__
-
-    return hashlib.sha256(f"{__version__}{key}".encode()).hexdigest()[:16]
-
-
 def _keep_refits(path: Path, key: str, refits: list[Refit]) -> None:
     import numpy as np
 
     data = io.BytesIO()
     parts = {name: np.stack([np.asarray(getattr(one, name)) for one in refits]) for name in ("seed", "errors", "own")}
-    np.savez_compressed(data, allow_pickle=False, kcal=np.array("check"), key=np.array(_run_digest(key)), **parts)
+    np.savez_compressed(data, allow_pickle=False, kcal=np.array("check"), key=np.array(key), **parts)
     write_atomic(path, data.getvalue())
 
 
@@ -199,7 +183,7 @@ def _kept_refits(path: Path, key: str) -> list[Refit]:
     arrays = read_npz(read_bytes(path, _LARGEST_RUN), str(path), _LARGEST_RUN, "run of kcal check")
     if str(arrays.get("kcal")) != "check":
         raise FileError(f"{path}: not a file of kcal check; choose another name with -o")
-    if str(arrays.get("key")) != _run_digest(key):
+    if str(arrays.get("key")) != key:
         warn(f"{path} has refits of another camera, capture, range or version of kcal; they are made anew")
         return []
     try:

@@ -128,6 +128,7 @@ def diff_command(
     from kcal.lens.difference import camera_difference, difference_text
 
     cameras = [single_camera(source) for source in (first, second)]
+    then, now = (_temperature(camera) for camera in cameras)
     for source, camera in zip((first, second), cameras, strict=True):
         out.print(f"{source}: {_history(camera)}", markup=False)
     found = camera_difference(*cameras, at=distance, rotation=None if turn else torch.eye(3))
@@ -139,9 +140,8 @@ def diff_command(
         ratio=found.ratio,
         probability=found.probability,
         same=found.same,
-        temperature_c=[_temperature(camera) for camera in cameras],
+        temperature_c=[then, now],
     )
-    then, now = (_temperature(camera) for camera in cameras)
     if then is not None and now is not None and now != then:
         out.print(f"{abs(now - then):g} °C {'warmer' if now > then else 'colder'}", markup=False)
     for line in difference_text(found):
@@ -218,14 +218,12 @@ def interpolate_command(
         "misfit": found.misfit_px,
     }
     total = sum(value**2 for value in parts.values()) ** 0.5
+    how, whence = "calibrated", ""
     if isinstance(made, LensSetting) and made.interpolated_from:
-        text = ", ".join(f"{number_text(value, digits=2)} by {name}" for name, value in parts.items() if value)
-        out.print(
-            f"{made}, interpolated: points at infinity ± {number_text(total, digits=2)} px (median): {text}",
-            markup=False,
-        )
-    else:
-        out.print(f"{made}, calibrated: points at infinity ± {number_text(total, digits=2)} px (median)", markup=False)
+        by = [f"{number_text(value, digits=2)} by {name}" for name, value in parts.items() if value]
+        how, whence = "interpolated", f": {', '.join(by)}"
+    known = f"points at infinity ± {number_text(total, digits=2)} px (median)"
+    out.print(f"{made}, {how}: {known}{whence}", markup=False)
     tell(setting=wanted, sigma_px={"median": total, **parts})
     save_camera(found.camera, output, name=output.name.split(".")[0])
     print_wrote(output)

@@ -22,7 +22,7 @@ from kcal.files import dump_json, make_folder, read_bytes, write_atomic
 from kcal.io.camera_file import load_camera
 from kcal.io.images import write_png, write_video
 from kcal.io.rig_file import load_pair
-from kcal.lens.rig import Origin, Rig
+from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.report.positions import save_site_sketch
 from kcal.report.practice_score import score_lens, score_positions, score_rig, score_tracks
@@ -284,10 +284,9 @@ def practice_score(folder: Path) -> None:
     """
     truth = read_truth_file(folder)
     _score_cameras(folder, truth)
-    rig = _score_rig(folder, truth)
-    if rig is not None:
-        _score_positions(folder, truth)
-        _score_tracks(folder, truth)
+    if _score_rig(folder, truth):
+        _score_positions(_first(folder, POSITIONS), truth)
+        _score_tracks(_first(folder, TRACKS), truth)
     step = next_step(folder)
     if step is None:
         out.print("All steps are done.")
@@ -310,85 +309,74 @@ def next_step(folder: Path) -> Exercise | None:
     return None
 
 
-def _head(text: str) -> None:
-    out.print(f"\n[bold]{text}[/]")
+def _show(what: str, heads: list[str], rows: list[list[str]]) -> None:
+    out.print(f"\n[bold]{what}[/]")
+    if rows:
+        print_table([heads, *rows])
+    else:
+        out.print("not done yet")
 
 
 def _score_cameras(folder: Path, truth: dict[str, Any]) -> None:
-    rows = [["camera", "RMS px", "middle px", "largest px", "sideways at 5 km", "range at 5 km"]]
+    rows = []
     for side in ("left", "right"):
         path = folder / f"{side}.camera.json"
         if path.exists():
             found = score_lens(load_camera(path), truth["cameras"][side], truth["baseline_m"])
             pixels = [f"{value:.3f}" for value in (found.rms, found.middle, found.largest)]
             rows.append([side, *pixels, f"{found.sideways_m:.2f} m", f"{found.range_m:.0f} m"])
-    _head("Cameras: error over the image after the best-fit rotation")
-    _print_or_missing(rows)
+    heads = ["camera", "RMS px", "middle px", "largest px", "sideways at 5 km", "range at 5 km"]
+    _show("Cameras: error over the image after the best-fit rotation", heads, rows)
 
 
-def _score_rig(folder: Path, truth: dict[str, Any]) -> Rig | None:
-    _head("Rig: error of ranges over the image, with marks that have no noise")
+def _score_rig(folder: Path, truth: dict[str, Any]) -> bool:
+    """Whether there is a rig."""
     path = folder / "rig.json"
-    if not path.exists():
-        out.print("not done yet")
-        return None
-    rig = load_pair(path)
-    rows = [["at", "mean m", "RMS m", "one sigma as stated m"]]
-    for found in score_rig(rig, truth):
+    rig = load_pair(path) if path.exists() else None
+    rows = []
+    for found in [] if rig is None else score_rig(rig, truth):
         stated = "none" if found.stated is None else _short_meters(found.stated)
         rows.append([f"{found.range_m / 1000:g} km", _signed(found.mean), _short_meters(found.rms), stated])
-    print_table(rows)
-    true, own = truth["baseline_m"], float(rig.baseline)
-    out.print(f"baseline {own:.4f} m, {1e3 * (own - true):+.1f} mm off")
-    return rig
+    heads = ["at", "mean m", "RMS m", "one sigma as stated m"]
+    _show("Rig: error of ranges over the image, with marks that have no noise", heads, rows)
+    if rig is not None:
+        true, own = truth["baseline_m"], float(rig.baseline)
+        out.print(f"baseline {own:.4f} m, {1e3 * (own - true):+.1f} mm off")
+    return rig is not None
 
 
-def _score_positions(folder: Path, truth: dict[str, Any]) -> None:
-    _head("Positions: against the truth")
-    path = _first(folder, POSITIONS)
-    if path is None:
-        out.print("not done yet")
-        return
-    scores = score_positions(path, truth)
-    rows = [["target", "range m", "off on the map m", "off in range m", "95 % interval contains it"]]
-    for found in scores:
-        cells = [f"{found.range_m:.0f}", _short_meters(found.level), _signed(found.range_off)]
-        rows.append([found.name, *cells, "yes" if found.contains else "no"])
-    _print_or_missing(rows)
+def _score_positions(path: Path | None, truth: dict[str, Any]) -> None:
+    scores = [] if path is None else score_positions(path, truth)
+    rows = [
+        [found.name, f"{found.range_m:.0f}", _short_meters(found.level), _signed(found.range_off),
+         "yes" if found.contains else "no"]
+        for found in scores
+    ]  # fmt: skip
+    heads = ["target", "range m", "off on the map m", "off in range m", "95 % interval contains it"]
+    _show("Positions: against the truth", heads, rows)
     if scores:
         inside = sum(found.contains for found in scores)
         out.print(f"{inside} of {len(scores)} intervals contain the true range; 95 % are to be expected")
     missing = [name for name in truth["targets"] if name.casefold() not in {each.name.casefold() for each in scores}]
-    if missing:
+    if path is not None and missing:
         out.print(f"not among the positions: {', '.join(missing)} (names as in targets.csv)", markup=False)
 
 
-def _score_tracks(folder: Path, truth: dict[str, Any]) -> None:
-    _head("Tracks: against the ships")
-    path = _first(folder, TRACKS)
-    if path is None:
-        out.print("not done yet")
-        return
-    scores, strays = score_tracks(path, truth)
-    rows = [["ship", "range m", "followed", "tracks", "off on the map m", "off in range m", "intervals with the truth"]]
+def _score_tracks(path: Path | None, truth: dict[str, Any]) -> None:
+    scores, strays = ([], 0) if path is None else score_tracks(path, truth)
+    rows = []
     for found in scores:
         share = "" if math.isnan(found.contained) else f"{100 * found.contained:.0f} %"
         counts = [f"{found.range_m:.0f}", f"{100 * found.followed:.0f} %", f"{found.tracks}"]
         rows.append([found.name, *counts, _short_meters(found.level), _short_meters(found.range_off), share])
-    print_table(rows)
+    heads = ["ship", "range m", "followed", "tracks", "off on the map m", "off in range m", "intervals with the truth"]
+    _show("Tracks: against the ships", heads, rows)
     if strays:
         warn(f"{strays} tracks are near no ship")
 
 
 def _first(folder: Path, names: tuple[str, ...]) -> Path | None:
     return next((folder / name for name in names if (folder / name).exists()), None)
-
-
-def _print_or_missing(rows: list[list[str]]) -> None:
-    if len(rows) > 1:
-        print_table(rows)
-    else:
-        out.print("not done yet")
 
 
 def _short_meters(value: float) -> str:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import shlex
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -181,6 +182,19 @@ def run(name: str, *arguments: object) -> None:
     get_group(app).commands[name].main(words, standalone_mode=False)
 
 
+def _calibrate_both(
+    output: Path, images: dict[str, list[Path]], board: Sequence[str], lap: Callable[[str], object] = lambda _: None
+) -> None:
+    """Detect the board in the images of each camera, and calibrate; `lap` is told what was done."""
+    for side in SIDES:
+        run("detect", *images[side], *board, "-o", output / f"{side}.obs.json")
+    lap("detection")
+    for side in SIDES:
+        camera, picture = output / f"{side}.camera.json", output / f"{side}.png"
+        run("calibrate", output / f"{side}.obs.json", "-o", camera, "--picture", picture)
+    lap("calibration")
+
+
 def locate_again(output: Path, *options: object) -> str:
     """Locate `points.csv`, write positions and maps, and return the command that locates the points once more."""
     words = [output / "rig.json", output / "points.csv", *options]
@@ -212,12 +226,8 @@ def real_pairs(
     output: Path, folder: Path, size: str, square: str, board: Board, origin: Origin | None, heading: float
 ) -> None:
     """Calibrate from a folder of pairs, and locate two opposite corners of each board, whose distance is known."""
-    for side in SIDES:
-        images = _side_images(folder, side)
-        run("detect", *images, "--board", size, "--square", square, "-o", output / f"{side}.obs.json")
-    for side in SIDES:
-        camera, picture = output / f"{side}.camera.json", output / f"{side}.png"
-        run("calibrate", output / f"{side}.obs.json", "-o", camera, "--picture", picture)
+    images = {side: _side_images(folder, side) for side in SIDES}
+    _calibrate_both(output, images, ("--board", size, "--square", square))
     cameras, seen = ([output / f"{side}.{kind}.json" for side in SIDES] for kind in ("camera", "obs"))
     # Few pairs: none is left out, so that each board can be compared.
     run("rig", *cameras, "--pairs", *seen, "--keep-all", "-o", output / "rig.json")
@@ -275,7 +285,11 @@ def _board_ends(output: Path, board: Board) -> Marks:
 
 def simulated_site(output: Path, seed: int) -> None:
     """Render the site of a seed, run the whole chain, compare with the truth, and write everything to a folder."""
-    clock = _Clock()
+    laps = {"": time.perf_counter()}
+
+    def lap(name: str) -> None:
+        laps[name] = time.perf_counter()
+
     scene = DemoScene(seed=seed)
     out.print(
         f"A simulated site: two cameras {float(scene.rig.baseline):.3f} m apart behind ray-traced lenses, "
@@ -283,16 +297,10 @@ def simulated_site(output: Path, seed: int) -> None:
         f"{len(scene.targets.names)} targets."
     )
     _render(scene, output / "images")
-    clock.lap("rendering")
+    lap("rendering")
     board = scene.near_board
     size = "--board", f"{board.columns}x{board.rows}", "--square", f"{1e3 * board.square:g}mm"
-    for side in SIDES:
-        run("detect", output / "images" / f"{side}-near", *size, "-o", output / f"{side}.obs.json")
-    clock.lap("detection")
-    for side in SIDES:
-        camera, picture = output / f"{side}.camera.json", output / f"{side}.png"
-        run("calibrate", output / f"{side}.obs.json", "-o", camera, "--name", side, "--picture", picture)
-    clock.lap("calibration")
+    _calibrate_both(output, {side: [output / "images" / f"{side}-near"] for side in SIDES}, size, lap)
     _write_places(output / "survey.csv", scene.surveyed(scene.landmarks), sigma=scene.survey_sigma)
     marks = scene.landmark_marks
     write_marks(output / "landmarks.csv", Marks.of_pair(scene.landmarks.names, marks.left, marks.right))
@@ -303,7 +311,7 @@ def simulated_site(output: Path, seed: int) -> None:
         # The simulated light goes straight.
         "--refraction=0±0",
     )  # fmt: skip
-    clock.lap("rig")
+    lap("rig")
 
     marks, targets = scene.target_marks, scene.targets
     write_marks(output / "points.csv", Marks.of_pair(targets.names, marks.left, marks.right))
@@ -314,7 +322,7 @@ def simulated_site(output: Path, seed: int) -> None:
         locate_points(Localizer(rig, pixel_sigma=scene.mark_sigma), Marks.of_pair(targets.names, *pixels))
         for pixels in ((marks.left, marks.right), (marks.true_left, marks.true_right))
     )
-    clock.lap("positions and maps")
+    lap("positions and maps")
     rows, chance = truth_rows(located, exact, targets.enu), chance_text(located, targets.enu)
     out.print("\nTrue against estimated positions", markup=False)
     print_table(rows)
@@ -326,7 +334,8 @@ def simulated_site(output: Path, seed: int) -> None:
     out.print(chance, markup=False)
     run("report", output / "rig.json", "--require", REQUIREMENT, "--pixel-sigma", scene.mark_sigma)
     save_site_summary(output, scene, rows, chance, command)
-    out.print(f"Time: {clock.text()}.")
+    times = [f"{name} {end - start:.1f} s" for (_, start), (name, end) in itertools.pairwise(laps.items())]
+    out.print(f"Time: {', '.join(times)}, together {laps['positions and maps'] - laps['']:.1f} s.")
     print_results(output, command)
 
 
@@ -338,23 +347,6 @@ def _more_draws(scene: DemoScene, rig: Rig) -> str:
     localize = Localizer(rig, pixel_sigma=scene.mark_sigma)
     share = interval_coverage(localize, marks.left, marks.right, ranges)
     return f"With {draws} other draws of the noise in the marks, {100 * share:.0f} % of the intervals contain it."
-
-
-class _Clock:
-    """Seconds of each stage."""
-
-    def __init__(self) -> None:
-        self._laps: list[tuple[str, float]] = []
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self._laps.append((name, now - self._last))
-        self._last = now
-
-    def text(self) -> str:
-        parts = [f"{name} {seconds:.1f} s" for name, seconds in self._laps]
-        return ", ".join([*parts, f"together {sum(seconds for _, seconds in self._laps):.1f} s"])
 
 
 def _render(scene: DemoScene, folder: Path) -> None:

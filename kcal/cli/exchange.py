@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import orjson
 
@@ -13,9 +13,6 @@ from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import cameras_and_rig, named_source, picked
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
-
-if TYPE_CHECKING:
-    from kcal.lens.camera import Camera
 
 # Pixels (RMS) beyond which a lens model does not stand for a lens.
 _FAR = 0.5
@@ -142,18 +139,32 @@ def import_command(
     named = [named_source(source) for source in sources]
     paths, camera = [path for path, _ in named], next((name for _, name in named if name), None)
     check_writable(output, *paths)
+    what = "corners" if board is not None else "places" if paths[0].suffix.lower() in (".gpx", ".geojson") else ""
+    if what and len(paths) > 1:
+        raise InputError(f"{what} are read from one file{', with --board and --square' if board is not None else ''}")
     if board is not None:
-        _import_corners(paths, output, board, square, size)
-        return
-    if paths[0].suffix.lower() in (".gpx", ".geojson"):
-        _import_survey(paths, output, survey_sigma, geoid)
-        return
+        from kcal.corners.board import Board
+        from kcal.corners.foreign_corners import import_corners
 
+        seen = import_corners(paths[0], Board.parse(board, square), size)
+        seen.save(output)
+        weights = "with weights" if seen.covariances() is not None else "without weights"
+        corners = sum(pixel is not None for view in seen.views for pixel in view.pixels)
+        out.print(f"{len(seen.views)} views with {corners} corners, {weights}")
+    elif what:
+        _import_survey(paths[0], output, survey_sigma, geoid)
+    else:
+        _import_cameras(paths, camera, output, format=format, size=size, fisheye=fisheye, meters=unit)
+    print_wrote(output)
+
+
+def _import_cameras(paths: list[Path], camera: str | None, output: Path, **stated: Any) -> None:
+    """Read a camera, that of the name if there is one, or a rig, and write its file."""
     from kcal.io.camera_file import save_camera
     from kcal.io.formats import import_cameras
     from kcal.io.rig_file import save_rig
 
-    found = import_cameras(*paths, format=format, size=size, fisheye=fisheye, meters=unit)
+    found = import_cameras(*paths, **stated)
     for note in found.notes:
         warn(note)
     if camera is None and len(found.poses) > 2 and not found.unread:
@@ -167,42 +178,20 @@ def import_command(
         chosen = picked(found, camera, " ".join(map(str, paths)))
         save_camera(chosen, output)
         out.print(f"camera from {found.format}: {chosen.model}, {chosen.size[0]}x{chosen.size[1]} px", markup=False)
-    if without := [name for name, one in zip(found.names, found.cameras, strict=True) if not _has_error_bars(one)]:
+    known = [one.calibration is not None and one.calibration.covariance is not None for one in found.cameras]
+    if without := [name for name, stated in zip(found.names, known, strict=True) if not stated]:
         out.print(
             f"no error bars in the file: {', '.join(without)}. A rig takes such a camera as exact, and no σ knows "
             "the lens's errors",
             markup=False,
         )
-    print_wrote(output)
 
 
-def _has_error_bars(camera: Camera) -> bool:
-    return camera.calibration is not None and camera.calibration.covariance is not None
-
-
-def _import_corners(
-    sources: list[Path], output: Path, board: str, square: str | None, size: tuple[int, int] | None
-) -> None:
-    from kcal.corners.board import Board
-    from kcal.corners.foreign_corners import import_corners
-
-    if len(sources) != 1:
-        raise InputError("corners are read from one file, with --board and --square")
-    seen = import_corners(sources[0], Board.parse(board, square), size)
-    seen.save(output)
-    weights = "with weights" if seen.covariances() is not None else "without weights"
-    corners = sum(pixel is not None for view in seen.views for pixel in view.pixels)
-    out.print(f"{len(seen.views)} views with {corners} corners, {weights}")
-    print_wrote(output)
-
-
-def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid: float | None) -> None:
+def _import_survey(source: Path, output: Path, sigma: float | None, geoid: float | None) -> None:
     from kcal.locate.geodesy import enu_to_geodetic
     from kcal.locate.survey import EARTH, import_survey, places_csv
 
-    if len(sources) != 1:
-        raise InputError("places are read from one file")
-    survey = import_survey(sources[0], sigma=sigma, geoid=geoid)
+    survey = import_survey(source, sigma=sigma, geoid=geoid)
     assert survey.origin is not None
     places = enu_to_geodetic(survey.points, survey.origin).tolist()
     rows = (
@@ -211,7 +200,6 @@ def _import_survey(sources: list[Path], output: Path, sigma: float | None, geoid
     )
     write_atomic(output, places_csv(EARTH, rows))
     out.print(f"{len(places)} places")
-    print_wrote(output)
 
 
 # `kcal schema`: the JSON schema of each of kcal's own files.

@@ -75,29 +75,21 @@ def report_command(
         else _of_camera(subject, given, needs, baseline, pixel_sigma_of(pixel_sigma))
     )
     tell(verdict=found[0].to_dict())
-    if not told_usable(*found, output):
+    if not told_usable(found, output):
         raise typer.Exit(NO)
 
 
-def told_usable(
-    verdict: Verdict,
-    pictures: Callable[[], dict[str, bytes]],
-    tables: list[list[list[str]]],
-    page: Path | None,
-    *,
-    warned: Iterable[Finding] = (),
-) -> bool:
+def told_usable(found: Judged, page: Path | None, warned: Iterable[Finding] = ()) -> bool:
     """Print a verdict and write its page; returns whether it is a yes.
 
     Args:
-        verdict: what it says.
-        pictures: draws those of the page.
-        tables: of the page.
+        found: the verdict, and what its page shows.
         page: to write.
         warned: findings of which the command has warned already.
     """
     from kcal.report.pages import range_rows, save_verdict_page
 
+    verdict, pictures, tables = found
     print_verdict(verdict, warned)
     if page is not None:
         ranges = [range_rows(verdict)] if verdict.answers else []
@@ -149,7 +141,8 @@ def _of_camera(
         return found, dict, camera_tables(camera)
     if len(observations) > 1:
         raise InputError("a camera has one observations file; give --observations once")
-    return _judged_again(camera, observations[0], needs, baseline=baseline, mark_sigma=mark_sigma, name=name)
+    result, made = calibrated_again(camera, observations[0], f"calibrating {name}")
+    return judged(result, made, needs, baseline=baseline, mark_sigma=mark_sigma, name=name, stored=camera)
 
 
 def judged(
@@ -177,20 +170,18 @@ def judged(
     return verdict, lambda: camera_pictures(result, examination), camera_tables(result.camera, result, name)
 
 
-def _judged_again(
-    camera: Camera, observations: Path, needs: tuple[Requirement, ...], *, baseline: float = 10.0, mark_sigma: float,
-    name: str,
-) -> Judged:  # fmt: skip
-    """The verdict on a camera of a file, calibrated again from its views: files have no residuals and no poses."""
+def calibrated_again(
+    camera: Camera, observations: Path, what: str
+) -> tuple[CameraCalibrationResult, CalibrationOptions]:
+    """A camera of a file, calibrated once more from its views: files have no residuals and no poses."""
     from kcal.calibrate.camera.calibrate import calibrate_camera
     from kcal.calibrate.camera.trust import stored_options
     from kcal.corners.observations import Observations
 
     seen, options = Observations.load(observations), stored_options(camera)
     check_views_of([camera], [seen], [observations])
-    with steps(f"calibrating {name}", None) as advance:
-        result = calibrate_camera(seen, options, advance)
-    return judged(result, options, needs, baseline=baseline, mark_sigma=mark_sigma, name=name, stored=camera)
+    with steps(what, None) as advance:
+        return calibrate_camera(seen, options, advance), options
 
 
 def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], pixel_sigma: float | None) -> Judged:
@@ -241,7 +232,8 @@ def judged_sides(
     found = []
     with steps("cameras", len(observations)) as advance:
         for (side, camera), file in zip(cameras, observations, strict=False):
-            found.append(_judged_again(camera, file, (), mark_sigma=mark_sigma, name=side))
+            result, made = calibrated_again(camera, file, f"calibrating {side}")
+            found.append(judged(result, made, (), mark_sigma=mark_sigma, name=side, stored=camera))
             advance("")
     return found
 

@@ -86,20 +86,18 @@ def _as_written(content: dict[str, Any]) -> tuple[list[_Camera], _Rig | None] | 
     """Blocks of a file with their summaries; None where it has none, or was changed after they were written."""
     from kcal.io.file_summary import CameraSummary, RigSummary
 
+    def checked(kind: type[_Summary], summary: Any) -> _Summary:
+        return kind.model_validate_json(json.dumps(summary), strict=True)
+
     try:
-        if content["kcal"] == "camera":
-            cameras = [(content, _checked_summary(CameraSummary, content["summary"]))]
-            rig = None
-        else:
-            rig = content, _checked_summary(RigSummary, content["summary"])
-            if rig[1].of != digest({key: value for key, value in content.items() if key != "cameras"}):
-                return None
+        rig, blocks, summaries = None, [content], [content["summary"]]
+        if content["kcal"] == "rig":
+            rig = content, checked(RigSummary, content["summary"])
             # The rig knows more of its cameras than each of them knew before it was solved.
-            cameras = [
-                (block, _checked_summary(CameraSummary, known))
-                for block, known in zip(content["cameras"], content["summary"]["cameras"], strict=True)
-            ]
-        fresh = all(
+            blocks, summaries = content["cameras"], content["summary"]["cameras"]
+        cameras = [(block, checked(CameraSummary, known)) for block, known in zip(blocks, summaries, strict=True)]
+        own = {key: value for key, value in content.items() if key != "cameras"}
+        fresh = (rig is None or rig[1].of == digest(own)) and all(
             known.of == digest(block) and (known.board is None) == (block["calibration"] is None)
             for block, known in cameras
         )
@@ -107,10 +105,6 @@ def _as_written(content: dict[str, Any]) -> tuple[list[_Camera], _Rig | None] | 
     except (KeyError, TypeError, AttributeError, ValueError):
         # No such file was written by kcal: its reader says what is wrong.
         return None
-
-
-def _checked_summary(kind: type[_Summary], summary: Any) -> _Summary:
-    return kind.model_validate_json(json.dumps(summary), strict=True)
 
 
 def _computed_anew(file: Path, kind: str) -> tuple[list[_Camera], _Rig | None]:

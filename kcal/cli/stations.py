@@ -238,7 +238,7 @@ def solve_and_write(
         def drawn() -> dict[str, bytes]:
             return {**rig_pictures(result), **side_pictures(sides)}
 
-        if not told_usable(verdict, drawn, stored_tables(rig), report, warned=warned_of(result)):
+        if not told_usable((verdict, drawn, stored_tables(rig)), report, warned_of(result)):
             raise typer.Exit(NO)
 
 

@@ -27,8 +27,9 @@ from kcal.corners.marker_boards import MIN_CORNERS, enough, find_aprilgrid, find
 from kcal.corners.observations import Failure, Observations, View, common_size, rescaled
 from kcal.corners.recognize import (
     Recognized,
-    Votes,
+    SeenBoard,
     clear_circles,
+    recognized,
     seen_board,
     seen_instead,
     size_advice,
@@ -238,14 +239,16 @@ def recognize_images(images: Iterable[Any], most: int, time_limit: float | None 
         most: images to look at.
         time_limit: seconds of processor time for each.
     """
-    votes = Votes()
+    seen: list[SeenBoard | None] = []
+    found = recognized(seen)
     with Limited(time_limit) as limited:
         for image in itertools.islice(images, most):
             with suppress(FileError, TookTooLongError):
-                votes.add(limited(seen_board, to_8bit(image_and_hash(image)[0]), votes.without_markers))
-            if votes.agreed:
+                seen.append(limited(seen_board, to_8bit(image_and_hash(image)[0]), found.without_markers))
+            found = recognized(seen)
+            if found.agreed:
                 break
-    return votes.result
+    return found
 
 
 def recognize_board(

@@ -331,6 +331,8 @@ class Recognized(NamedTuple):
         sure: those of them in which all of its ends are seen, or its markers.
         looked: images looked at.
         shown: images that show any board, by its text.
+        agreed: whether no other image need be looked at.
+        without_markers: whether so many images show a board without markers that none need be sought.
     """
 
     seen: SeenBoard | None
@@ -338,6 +340,8 @@ class Recognized(NamedTuple):
     sure: int
     looked: int
     shown: Counter[str]
+    agreed: bool
+    without_markers: bool
 
     def board(self, square: str | None, note: Callable[[Recognized], object] | None = None) -> Board:
         """The board, with squares of a side such as `25mm`; `note` is called with what was recognized.
@@ -361,44 +365,33 @@ class Recognized(NamedTuple):
         return self.seen.board(square)
 
 
-_Groups = dict[tuple[str, int, int, str], list[SeenBoard]]
+def recognized(images: Sequence[SeenBoard | None]) -> Recognized:
+    """Which board images show, of what each of them shows."""
+    groups: dict[tuple[str, int, int, str], list[SeenBoard]] = {}
+    for one in images:
+        if one is not None:
+            groups.setdefault(one.vote, []).append(one)
 
+    def weight(group: Sequence[SeenBoard]) -> int:
+        return sum(_SURE if one.sure else 1 for one in group)
 
-class Votes:
-    """Votes of images on the board that they show."""
-
-    def __init__(self) -> None:
-        self._groups: _Groups = {}
-        self._looked = 0
-
-    def add(self, seen: SeenBoard | None) -> None:
-        """Count one image more."""
-        self._looked += 1
-        if seen is not None:
-            self._groups.setdefault(seen.vote, []).append(seen)
-
-    @property
-    def without_markers(self) -> bool:
-        """Whether so many images show a board without markers that none need be sought."""
-        plain = [len(group) for (kind, *_), group in self._groups.items() if kind not in ("charuco", "aprilgrid")]
-        return sum(plain) >= _WITHOUT_MARKERS
-
-    @property
-    def agreed(self) -> bool:
-        """Whether no other image need be looked at."""
-        _, own, others = _leader(self._groups)
-        return own >= _LEAD and own >= 3 * others
-
-    @property
-    def result(self) -> Recognized:
-        """What they show."""
-        most, own, others = _leader(self._groups)
-        wholes = {vote: _together(group) for vote, group in self._groups.items()}
-        shown = Counter({whole.text: len(self._groups[vote]) for vote, whole in wholes.items()})
-        # One image of many may be wrong.
-        clear = own > 2 * others and (len(most) > 1 or self._looked <= 2)
-        seen = wholes[most[0].vote] if most and clear else None
-        return Recognized(seen, len(most), sum(one.sure for one in most), self._looked, shown)
+    most: list[SeenBoard] = max(groups.values(), key=weight, default=[])
+    # A part of the board is not against it.
+    against = [one for group in groups.values() if group is not most for one in group if not _is_part(one, most[0])]
+    own, others = weight(most), weight(against)
+    wholes = {vote: _together(group) for vote, group in groups.items()}
+    # One image of many may be wrong.
+    clear = own > 2 * others and (len(most) > 1 or len(images) <= 2)
+    plain = [len(group) for (kind, *_), group in groups.items() if kind not in ("charuco", "aprilgrid")]
+    return Recognized(
+        seen=wholes[most[0].vote] if most and clear else None,
+        votes=len(most),
+        sure=sum(one.sure for one in most),
+        looked=len(images),
+        shown=Counter({whole.text: len(groups[vote]) for vote, whole in wholes.items()}),
+        agreed=own >= _LEAD and own >= 3 * others,
+        without_markers=sum(plain) >= _WITHOUT_MARKERS,
+    )
 
 
 def _together(group: Sequence[SeenBoard]) -> SeenBoard:
@@ -407,17 +400,6 @@ def _together(group: Sequence[SeenBoard]) -> SeenBoard:
     dictionary = max((one.dictionary for one in group), key=lambda name: DICTIONARIES.get(name, 0))
     share = float(np.median([one.share for one in group]))
     return group[0]._replace(rows=rows, dictionary=dictionary, share=share, sure=any(one.sure for one in group))
-
-
-def _leader(votes: _Groups) -> tuple[list[SeenBoard], int, int]:
-    """What most images show, its votes, and those against it: a part of the board is not against it."""
-
-    def weight(group: list[SeenBoard]) -> int:
-        return sum(_SURE if one.sure else 1 for one in group)
-
-    most: list[SeenBoard] = max(votes.values(), key=weight, default=[])
-    against = [one for group in votes.values() if group is not most for one in group if not _is_part(one, most[0])]
-    return most, weight(most), weight(against)
 
 
 def _is_part(one: SeenBoard, whole: SeenBoard) -> bool:

@@ -154,7 +154,7 @@ def score_positions(path: Path, truth: dict[str, Any]) -> list[PositionScore]:
     for row in located_rows(path, truth):
         place = true.get(row.name.strip().casefold())
         if place is not None:
-            found.append(_position_score(row.name, row, place))
+            found.append(_position_score(row, place))
     return sorted(found, key=lambda score: score.range_m)
 
 
@@ -184,38 +184,33 @@ def score_tracks(path: Path, truth: dict[str, Any]) -> tuple[list[TrackScore], i
     """Compare tracks with the ships that they are nearest to; and how many tracks are near none."""
     times = np.array(truth["ships"]["times"])
     ships = {name: np.array(places) for name, places in truth["ships"]["places"].items()}
-    tracks: dict[str, list[PositionRow]] = defaultdict(list)
+    tracks: dict[str, list[tuple[float, PositionRow]]] = defaultdict(list)
     for row in located_rows(path, truth):
         if row.time is not None:
-            tracks[row.name].append(row)
-    scores: dict[str, list[tuple[str, float, PositionScore]]] = defaultdict(list)
+            tracks[row.name].append((row.time, row))
+    scores: dict[str, list[tuple[int, PositionScore]]] = {ship: [] for ship in ships}
     strays = 0
-    for name, rows in tracks.items():
+    for rows in tracks.values():
         each = {
-            ship: [
-                (row.time or 0.0, _position_score(name, row, _place_at(places, times, row.time or 0.0))) for row in rows
-            ]
+            ship: [(round(1e3 * time), _position_score(row, _place_at(places, times, time))) for time, row in rows]
             for ship, places in ships.items()
         }
         nearest = min(each, key=lambda ship: float(np.median([score.level for _, score in each[ship]])))
-        shares = [score.level / score.range_m for _, score in each[nearest]]
-        if np.median(shares) > _STRAY:
+        if np.median([score.level / score.range_m for _, score in each[nearest]]) > _STRAY:
             strays += 1
-            continue
-        scores[nearest] += [(name, time, score) for time, score in each[nearest]]
+        else:
+            scores[nearest] += each[nearest]
     found = []
-    for ship, places in ships.items():
-        own = scores[ship]
-        moments = {round(1e3 * time) for _, time, _ in own}
+    for ship, own in scores.items():
         found.append(
             TrackScore(
                 name=ship,
-                range_m=float(np.linalg.norm(places, axis=-1).mean()),
-                followed=len(moments) / len(times),
-                tracks=len({name for name, _, _ in own}),
-                level=_median([score.level for *_, score in own]),
-                range_off=_median([abs(score.range_off) for *_, score in own]),
-                contained=float(np.mean([score.contains for *_, score in own])) if own else math.nan,
+                range_m=float(np.linalg.norm(ships[ship], axis=-1).mean()),
+                followed=len({moment for moment, _ in own}) / len(times),
+                tracks=len({score.name for _, score in own}),
+                level=_median([score.level for _, score in own]),
+                range_off=_median([abs(score.range_off) for _, score in own]),
+                contained=float(np.mean([score.contains for _, score in own])) if own else math.nan,
             )
         )
     return sorted(found, key=lambda score: score.range_m), strays
@@ -229,11 +224,11 @@ def _place_at(places: Floats, times: Floats, time: float) -> Floats:
     return np.array([np.interp(time, times, column) for column in places.T])
 
 
-def _position_score(name: str, row: PositionRow, true: Floats) -> PositionScore:
+def _position_score(row: PositionRow, true: Floats) -> PositionScore:
     away = float(np.linalg.norm(true))
     east, north = row.enu[:2] - true[:2]
     contains = row.range_low_m <= away <= row.range_high_m
-    return PositionScore(name, away, math.hypot(east, north), row.range_m - away, contains)
+    return PositionScore(row.name, away, math.hypot(east, north), row.range_m - away, contains)
 
 
 class PositionRow(NamedTuple):
