@@ -10,12 +10,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
+import typer
 from rich.markup import escape
-from typer.main import get_group
+from typer.main import get_command
 
 from kcal.calibrate.rig.pairs import pair_by_name
+from kcal.cli.calibrate import calibrate_command
 from kcal.cli.console import err, out, print_table, steps
-from kcal.cli.main import app
+from kcal.cli.detect import detect_command
+from kcal.cli.locate import locate_command
+from kcal.cli.options import Command, declared
+from kcal.cli.report import report_command
+from kcal.cli.rig import solve_command
 from kcal.corners.board import Board
 from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
@@ -173,13 +179,19 @@ def _yourself_part(command: str) -> Part:
 # Steps that both demonstrations share: run a command, locate the points, list the results.
 
 SIDES = ("left", "right")
+_COMMANDS: dict[str, Callable[..., None]] = {
+    "detect": detect_command, "calibrate": calibrate_command, "rig": solve_command, "locate": locate_command,
+    "report": report_command,
+}  # fmt: skip
 
 
 def run(name: str, *arguments: object) -> None:
     """Print a command as a user would type it, and run it, without what kcal.toml says."""
     words = [str(argument) for argument in arguments]
     out.print(f"\n[bold]kcal {escape(shlex.join([name, *words]))}[/]")
-    get_group(app).commands[name].main(words, standalone_mode=False)
+    app = typer.Typer()
+    app.command(cls=Command)(declared(_COMMANDS[name]))
+    get_command(app).main(words, standalone_mode=False)
 
 
 def _calibrate_both(

@@ -28,8 +28,8 @@ from kcal.corners.observations import Failure, Observations, View, common_size, 
 from kcal.corners.recognize import (
     Recognized,
     SeenBoard,
+    board_of_most,
     clear_circles,
-    recognized,
     seen_board,
     seen_instead,
     size_advice,
@@ -240,12 +240,12 @@ def recognize_images(images: Iterable[Any], most: int, time_limit: float | None 
         time_limit: seconds of processor time for each.
     """
     seen: list[SeenBoard | None] = []
-    found = recognized(seen)
+    found = board_of_most(seen)
     with Limited(time_limit) as limited:
         for image in itertools.islice(images, most):
             with suppress(FileError, TookTooLongError):
                 seen.append(limited(seen_board, to_8bit(image_and_hash(image)[0]), found.without_markers))
-            found = recognized(seen)
+            found = board_of_most(seen)
             if found.agreed:
                 break
     return found

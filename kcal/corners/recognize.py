@@ -365,7 +365,7 @@ class Recognized(NamedTuple):
         return self.seen.board(square)
 
 
-def recognized(images: Sequence[SeenBoard | None]) -> Recognized:
+def board_of_most(images: Sequence[SeenBoard | None]) -> Recognized:
     """Which board images show, of what each of them shows."""
     groups: dict[tuple[str, int, int, str], list[SeenBoard]] = {}
     for one in images:
