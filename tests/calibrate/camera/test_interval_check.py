@@ -129,7 +129,7 @@ def test_command(
     told = json.loads(capsys.readouterr().out)
     assert told["true"] is True
     assert told["refits"] == 11
-    assert told["against"]["same"] is True
+    assert told["against_same"] is True
     assert "10 refits are done already" in told["text"][0]
     assert Path("map.png").stat().st_size > 10_000
     fault = Finding(name="model", severity="doubt", text="halves differ", action="take more views")
