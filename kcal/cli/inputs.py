@@ -321,17 +321,13 @@ def _candidates(wrong: _Given, kind: str) -> Iterator[str]:
 
 def _checked_inputs(wanted: Wanted, value: Any) -> list[str]:
     """The files that are checked: of a list of images, one that is none is listed by the command and stops nothing."""
-    texts = _file_texts(value)
+    values = value if isinstance(value, list | tuple) else [value]
+    texts = [str(one) for one in values if one is not None]
     if wanted is not IMAGES or not isinstance(value, list):
         return texts
     kinds = {text: file_kind(text) for text in texts}
     fine = [text for text in texts if kinds[text] in wanted.kinds]
     return [text for text in texts if kinds[text] == "missing"] or fine or texts
-
-
-def _file_texts(value: Any) -> list[str]:
-    values = value if isinstance(value, list | tuple) else [value]
-    return [str(one) for one in values if one is not None]
 
 
 def _unseen(text: str) -> bool:

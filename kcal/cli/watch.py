@@ -125,8 +125,13 @@ def watch_command(
 
 def _follow(watcher: Watcher, rig: Rig, sources: tuple[str, str], hooks: list[Webhook], *, ends: bool) -> None:
     """Look until the sources end, it is stopped, or an alarm ends it."""
-    frames = None if Path(sources[0]).is_dir() else _frame_pairs(rig, sources)
-    stopped = False
+    frames, stopped = None, False
+    if not Path(sources[0]).is_dir():
+        with with_extra("video", "videos need"):
+            from kcal.pipeline.video_source import FramesTogether
+
+        sizes = {"left": rig.left.size, "right": rig.right.size}
+        frames = FramesTogether(sources, sizes, pairs=True, tell=lambda text: err.print(text, markup=False))
 
     def stop(*_: object) -> None:
         nonlocal stopped
@@ -151,14 +156,6 @@ def _follow(watcher: Watcher, rig: Rig, sources: tuple[str, str], hooks: list[We
     finally:
         if frames is not None:
             frames.close()
-
-
-def _frame_pairs(rig: Rig, sources: tuple[str, str]) -> FramesTogether:
-    with with_extra("video", "videos need"):
-        from kcal.pipeline.video_source import FramesTogether
-
-    sizes = {"left": rig.left.size, "right": rig.right.size}
-    return FramesTogether(sources, sizes, pairs=True, tell=lambda text: err.print(text, markup=False))
 
 
 def _of_frames(watcher: Watcher, frames: FramesTogether) -> Iterator[tuple[float, Gray, Gray]]:
