@@ -292,9 +292,7 @@ def calibrate_command(
     places = _camera_files(obs, output, picture, report, name)
     if model not in ("hybrid", "network"):
         LensModel.named(model)
-    known = None
-    if camera is not None:
-        known = calibrated_camera(camera)
+    known = None if camera is None else calibrated_camera(camera)
 
     from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.camera.checks import OutlierRejection

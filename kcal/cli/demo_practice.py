@@ -139,24 +139,18 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
     with steps("rendering", sum(work for _, work, _ in missing) or None) as advance:
         for path, work, write in missing:
             make_folder((folder / path).parent)
-            left = work
             said = f"{path}"
-
-            def step(said: str = said) -> None:
-                nonlocal left
-                left -= 1
-                advance(said)
-
             advance(said, 0)
             try:
-                write(folder / path, step)
+                write(folder / path, functools.partial(advance, said))
             except ImportError as error:
                 extra = _EXTRAS.get(error.name or "", "video")
                 cure = f"pip install 'kcal[{extra}]', and run this again"
                 err.print(f"{path} needs {error.name}, which is not installed: {cure}", markup=False)
                 continue
             done += 1
-            advance(said, left)
+            # Of a film each frame was told.
+            advance(said, 0 if path.suffix == ".mp4" else work)
     kept = len(parts) - len(missing)
     text = f"; {kept} files were there already and are as they were" if kept else ""
     out.print(f"wrote {done} files to {folder}{text}", markup=False)
@@ -204,7 +198,9 @@ def _practice_parts(site: practice.PracticeSite, frames: int) -> Iterator[tuple[
     yield Path("survey.csv"), 1, text(lambda: survey_text(site.scene))
     yield Path("targets.csv"), 1, text(targets_text)
     yield Path("find_ships.py"), 1, text(lambda: _template("find_ships.txt"))
-    yield from _board_parts(site)
+    for index, (side, name, pose) in enumerate(scene_views(site.scene)):
+        write = functools.partial(_board, site.scene, index, side, pose)
+        yield Path("boards", side, f"{name.removeprefix('near-')}.png"), _BOARD_STEPS, write
     for side in practice.SIDES:
         yield Path("site", f"{side}.png"), _PICTURE_STEPS, functools.partial(_picture, site, side)
     yield from ((Path("night", night_name(side)), 1, functools.partial(_night, site, side)) for side in practice.SIDES)
@@ -214,16 +210,9 @@ def _practice_parts(site: practice.PracticeSite, frames: int) -> Iterator[tuple[
         yield Path("video", f"{side}.mp4"), frames, functools.partial(_film, site, side, frames)
 
 
-def _board_parts(site: practice.PracticeSite) -> Iterator[tuple[Path, int, _Write]]:
-    scene = site.scene
-    for index, (side, name, pose) in enumerate(scene_views(scene)):
-
-        def write(path: Path, _: Callable[[], None], side: str = side, index: int = index, pose: Any = pose) -> None:
-            lens = getattr(scene.rig, side)
-            image = render_board(lens, pose, scene.near_board, scene.render, scene.generator(index))
-            write_png(path, image.numpy())
-
-        yield Path("boards", side, f"{name.removeprefix('near-')}.png"), _BOARD_STEPS, write
+def _board(scene: DemoScene, index: int, side: str, pose: Any, path: Path, _: Callable[[], None]) -> None:
+    image = render_board(getattr(scene.rig, side), pose, scene.near_board, scene.render, scene.generator(index))
+    write_png(path, image.numpy())
 
 
 def _picture(site: practice.PracticeSite, side: practice.Side, path: Path, _: Callable[[], None]) -> None:

@@ -80,18 +80,14 @@ def detect_command(
     if keep is not None:
         make_folder(keep)
     if streams or (len(images) == 1 and Path(images[0]).suffix.lower() in VIDEO_SUFFIXES):
-        searched = 0
-
-        def count(_: str) -> None:
-            nonlocal searched
-            searched += 1
-
+        searched: list[str] = []
         pattern = given or board_in_images(images, square, time_limit)
         with steps(f"watching {streams[0]} for {duration:g} s" if streams else "searching the video", None):
             observations = detect_video(
-                images[0], pattern, refine.value, progress=count, time_limit=time_limit, duration=duration, keep=keep
-            )
-        source = f"of {searched} sharp frames (repeats left out)"
+                images[0], pattern, refine.value, progress=searched.append, time_limit=time_limit, duration=duration,
+                keep=keep,
+            )  # fmt: skip
+        source = f"of {len(searched)} sharp frames (repeats left out)"
     else:
         paths = expand_images(images)
         check_writable(output, *paths)

@@ -29,8 +29,8 @@ from kcal.corners.recognize import (
     Recognized,
     SeenBoard,
     board_of_most,
-    clear_circles,
     seen_board,
+    seen_circles,
     seen_instead,
     size_advice,
     spread_order,
@@ -184,7 +184,7 @@ def seen_by_most(failed: Sequence[tuple[Any, str]], board: Board) -> tuple[str, 
                 image = to_8bit(image_and_hash(file)[0])
                 small = to_8bit(reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
                 # Corners may also be seen between circles.
-                text = (clear_circles(small, board) or text) if said else seen_instead(small, board)
+                text = (seen_circles(small, board, clear=True) or text) if said else seen_instead(small, board)
         if text:
             votes.setdefault(text.rpartition(": ")[2], []).append(text)
     most = max(votes.values(), key=len, default=[""])
@@ -282,7 +282,10 @@ def recognize_board(
     if not isinstance(paths, Iterator):
         files = _files_and_images(paths)
         paths = (files[number] for number in spread_order(len(files)))
-    return recognize_images(paths, _LOOKED_AT, time_limit).board(square, note)
+    found = recognize_images(paths, _LOOKED_AT, time_limit)
+    if note is not None and found.seen is not None:
+        note(found)
+    return found.board(square)
 
 
 # Find a board in one image, or in all images of a camera.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -343,8 +343,8 @@ class Recognized(NamedTuple):
     agreed: bool
     without_markers: bool
 
-    def board(self, square: str | None, note: Callable[[Recognized], object] | None = None) -> Board:
-        """The board, with squares of a side such as `25mm`; `note` is called with what was recognized.
+    def board(self, square: str | None) -> Board:
+        """The board, with squares of a side such as `25mm`.
 
         Raises:
             InputError: there is none, or the square is missing.
@@ -355,8 +355,6 @@ class Recognized(NamedTuple):
                 f"which board it is cannot be told from {self.looked} images that were looked at"
                 f"{f': {several}' if several else ': they show none'}; give --board COLUMNSxROWS (inner corners)"
             )
-        if note is not None:
-            note(self)
         if square is None:
             raise InputError(
                 f"the board is {self.seen.text}, seen in {self.votes} of {self.looked} images that were looked at. "
@@ -455,16 +453,11 @@ def seen_instead(image: npt.NDArray[np.uint8], board: Board) -> str:
         return ""
     plain = board.pattern == "checkerboard" and board.dictionary is None
     found = seen_size(image) if plain else None
-    if (circles := clear_circles(image, board) if found else seen_circles(image, board)) is not None:
+    if (circles := seen_circles(image, board, clear=found is not None)) is not None:
         return circles
     found = found or seen_size(image)
     own = (max(board.columns, board.rows), min(board.columns, board.rows))
     return "" if found is None or (found == own and plain) else size_advice(found, board)
-
-
-def clear_circles(image: npt.NDArray[np.uint8], board: Board) -> str | None:
-    """As `seen_circles`, where blurred squares do not pass for circles: most of the spots are rounder."""
-    return seen_circles(image, board) if clear_spots(image) else None
 
 
 def size_advice(found: tuple[int, int], board: Board) -> str:
@@ -499,10 +492,16 @@ def seen_markers(image: npt.NDArray[np.uint8], board: Board) -> str:
     return ""
 
 
-def seen_circles(image: npt.NDArray[np.uint8], board: Board) -> str | None:
-    """What to say of a grid of circles in an image; None if there is none, empty if it may be the board's own."""
+def seen_circles(image: npt.NDArray[np.uint8], board: Board, *, clear: bool = False) -> str | None:
+    """What to say of a grid of circles in an image; None if there is none, empty if it may be the board's own.
+
+    Args:
+        image: (H, W).
+        board: that was asked for.
+        clear: most of the spots must be so round that blurred squares do not pass for circles.
+    """
     count = len(like_sized(image))
-    if count < MIN_CIRCLES:
+    if count < MIN_CIRCLES or (clear and not clear_spots(image)):
         return None
     if board.pattern not in ("circles", "asymmetric"):
         return f"some {count} circles were found: give --board circles:COLUMNSxROWS or asymmetric:COLUMNSxROWS"
