@@ -296,7 +296,7 @@ def test_what_is_left_out(sizes, left_out) -> None:
             [(640, 480), (640, 360)],
             r"1 of 640x480 px \(a\); 1 of 640x360 px \(b\); detect those of each size",
         ),
-        ([(640, 480), (480, 640), None], "turn back those that were turned by 90 degrees, or run"),
+        ([(640, 480), (480, 640), None], "turn back those that were turned by 90 degrees, or detect"),
         ([(640, 480), (640, 480), (640, 360), (500, 360)], "none has more than half: 2 of 640x480"),
     ],
 )
