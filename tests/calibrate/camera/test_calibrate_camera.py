@@ -276,7 +276,7 @@ class TestDegenerate:
     @pytest.mark.parametrize("views", [1, 2])
     def test_too_few_views(self, views: int) -> None:
         truth = camera()
-        with pytest.raises(DegenerateError, match=rf"{views} view\(s\) of the board: at least 3 at different tilts"):
+        with pytest.raises(DegenerateError, match=rf"^{views} views? of the board: at least 3 at different tilts"):
             solve(pixels_of(truth, motions(truth, views, 1)))
 
     @pytest.mark.parametrize("noise", [0.0, 0.1, 0.5])
