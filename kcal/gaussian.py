@@ -268,8 +268,8 @@ class Covariance:
 
     @property
     def sigma(self) -> Tensor:
-        """(S,) standard deviations, infinite where not determined."""
-        return self.variances(torch.eye(len(self._scale)).to(self._scale)).sqrt()
+        """(S,) standard deviations as in `matrix`, infinite where not determined."""
+        return torch.where(self.determined, self.matrix.diagonal().sqrt(), torch.inf)
 
     @property
     def determined(self) -> Tensor:
