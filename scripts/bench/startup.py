@@ -53,11 +53,17 @@ def on_terminal(words: list[str], folder: Path) -> Terminal:
     """Run a command on a terminal of its own (Linux)."""
     import pty
 
-    child, terminal = pty.fork()
-    if not child:
-        os.chdir(folder)
-        own = {"TERM": "xterm", "COLUMNS": "120", "LINES": "40"}
-        os.execve(sys.executable, [sys.executable, "-m", "kcal", *words], os.environ | own)
+    terminal, inside = pty.openpty()
+    child = subprocess.Popen(
+        [sys.executable, "-m", "kcal", *words],
+        cwd=folder,
+        env=os.environ | {"TERM": "xterm", "COLUMNS": "120", "LINES": "40"},
+        stdin=inside,
+        stdout=inside,
+        stderr=inside,
+        start_new_session=True,
+    ).pid
+    os.close(inside)
     times, text = [0.0], b""
     with contextlib.suppress(OSError):  # the terminal of a process that has ended
         while data := os.read(terminal, 2**16):
