@@ -18,5 +18,5 @@ def test_time_is_a_random_walk_and_temperature_is_not() -> None:
 
 @pytest.mark.parametrize("text", ["4h", "4:0.001", "4h:", "4h:-0.001", "4h:1e999", "x"])
 def test_what_is_no_aging(text: str) -> None:
-    with pytest.raises(InputError, match="write hours|from 0 on"):
+    with pytest.raises(InputError, match=r"write hours|from 0 on"):
         parse_aging(text, "--aged")
