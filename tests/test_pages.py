@@ -80,7 +80,8 @@ def test_the_tutorial_is_found_and_read(site: Path, width: int) -> None:
         # The search works from the disk, and leads to a page.
         if width < 1000:
             page.locator("label.md-header__button[for=__search]").click()
-        for word, title in (("undistort", "Undistort and rectify"), ("K", "From OpenCV: K"), ("HEIC", "Choose a board")):
+        found = {"undistort": "Undistort and rectify", "K": "From OpenCV: K", "HEIC": "Choose a board"}
+        for word, title in found.items():
             page.locator(".md-search__input").fill("")
             page.locator(".md-search__input").click()
             page.keyboard.type(word)
