@@ -186,7 +186,7 @@ def calibrate_command(
     output: kinds.Output,
     stars: Several[Annotated[str, Kind(metavar="IMAGES")]] | None = None,
     time: Rare[Annotated[str | None, Kind(metavar="TIME")]] = None,
-    site: Rare[Annotated[str | None, Kind(metavar="LAT,LON,HEIGHT")]] = None,
+    site: Rare[kinds.Site | None] = None,
     picture: Path | None = None,
     verbose: Rare[bool] = False,
     board_shape: Annotated[str, Kind(metavar="KIND")] = "printed",

@@ -116,13 +116,13 @@ def print_left_out(lines: Sequence[str], beside: Path, head: str) -> None:
         for line in lines:
             out.print(f"  {line}", markup=False)
         return
-    kinds = Counter(re.sub(r"[\d.]+", "N", line.partition(": ")[2]) for line in lines)
-    text, count = kinds.most_common(1)[0]
-    first = next(line.partition(": ")[2] for line in lines if re.sub(r"[\d.]+", "N", line.partition(": ")[2]) == text)
+    reasons = [line.partition(": ")[2] for line in lines]
+    kinds = [re.sub(r"[\d.]+", "N", reason) for reason in reasons]
+    most, count = Counter(kinds).most_common(1)[0]
     path = beside.with_name(f"{beside.name.split('.')[0]}.left-out.txt")
     write_atomic(path, "".join(f"{line}\n" for line in lines))
     _tell_more("wrote", str(path))
-    out.print(f"{head}, {count} of them: {first}; all of them: {path}", markup=False)
+    out.print(f"{head}, {count} of them: {reasons[kinds.index(most)]}; all of them: {path}", markup=False)
 
 
 def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> None:

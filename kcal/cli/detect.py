@@ -67,7 +67,7 @@ def detect_command(
     given = given_board(board, square)
 
     from kcal.corners.detect import Detection, detect
-    from kcal.corners.images import VIDEO_SUFFIXES, expand_images, turned_images
+    from kcal.corners.images import expand_images, is_video, turned_images
     from kcal.corners.video import detect_video
 
     failed: list[tuple[str, Path, Detection]] = []
@@ -79,7 +79,7 @@ def detect_command(
         raise InputError(f"{streams[0]}: a stream is searched alone, without other images")
     if keep is not None:
         make_folder(keep)
-    if streams or (len(images) == 1 and Path(images[0]).suffix.lower() in VIDEO_SUFFIXES):
+    if len(images) == 1 and is_video(images[0]):
         searched: list[str] = []
         pattern = given or board_in_images(images, square, time_limit)
         with steps(f"watching {streams[0]} for {duration:g} s" if streams else "searching the video", None):
@@ -152,7 +152,7 @@ def given_board(size: str, square: str | None) -> Board | None:
 def board_in_images(images: Sequence[str | Path], square: str | None, time_limit: float | None = None) -> Board:
     """The board that images, a video or a stream show; it is said."""
     from kcal.corners.detect import recognize_board
-    from kcal.corners.images import VIDEO_SUFFIXES
+    from kcal.corners.images import is_video
     from kcal.corners.recognize import Recognized
     from kcal.corners.video import spread_frames
 
@@ -162,9 +162,10 @@ def board_in_images(images: Sequence[str | Path], square: str | None, time_limit
             err.print(f"board {found.seen.text}, seen in {found.votes} of {found.looked} images that were looked at")
 
     first = images[0]
-    frames = is_stream(str(first)) or Path(first).suffix.lower() in VIDEO_SUFFIXES
     with steps("looking for a board", None):
-        return recognize_board(spread_frames(first) if frames else images, square, time_limit=time_limit, note=say)
+        return recognize_board(
+            spread_frames(first) if is_video(first) else images, square, time_limit=time_limit, note=say
+        )
 
 
 _CURED = 6  # images that are looked at to name the board of a refusal

@@ -16,7 +16,7 @@ from kcal.files import check_writable
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
-    from kcal.lens.rig import Rig
+    from kcal.lens.rig import Origin, Rig
     from kcal.stars.detect import DetectedStars
     from kcal.stars.lens import StarCamera
     from kcal.stars.night import NamedStars, SkyView
@@ -141,13 +141,13 @@ _PARTS = 3
 _FEW_IN_A_PART = 3
 
 
-def by_night(images: list[str] | None, time: str | None, place: str | None, output: Path, name: str) -> None:
+def by_night(images: list[str] | None, time: str | None, site: Origin | None, output: Path, name: str) -> None:
     """Calibrate a camera from the stars of night images alone, and write it.
 
     Args:
         images: files, folders and wildcards.
         time: as `--time`.
-        place: as `--site`: latitude, longitude and height, for refraction.
+        site: where the camera stands, for refraction.
         output: camera file.
         name: of the camera.
     """
@@ -155,7 +155,7 @@ def by_night(images: list[str] | None, time: str | None, place: str | None, outp
 
     if not images:
         raise InputError("give observations of a board (from `kcal detect`), or night images with --stars")
-    found = _by_stars(images, time, place, output)
+    found = _by_stars(images, time, site, output)
     camera = found.lens.camera
     if camera.calibration is not None and name:
         camera.calibration = dataclasses.replace(camera.calibration, name=name)
@@ -165,10 +165,10 @@ def by_night(images: list[str] | None, time: str | None, place: str | None, outp
 
 
 def joined_by_stars(
-    boards: CameraCalibrationResult, images: list[str], time: str | None, place: str | None, output: Path
+    boards: CameraCalibrationResult, images: list[str], time: str | None, site: Origin | None, output: Path
 ) -> CameraCalibrationResult:
     """The calibration by boards, refined by stars. Other arguments as of `by_night`."""
-    found = _by_stars(images, time, place, output, boards)
+    found = _by_stars(images, time, site, output, boards)
     agreement, joint = found.agreement, found.joint
     assert agreement is not None
     assert joint is not None
@@ -181,18 +181,20 @@ def joined_by_stars(
 
 
 def _by_stars(
-    images: list[str], time: str | None, place: str | None, output: Path, boards: CameraCalibrationResult | None = None
+    images: list[str],
+    time: str | None,
+    site: Origin | None,
+    output: Path,
+    boards: CameraCalibrationResult | None = None,
 ) -> StarCamera:
     """Read the images, calibrate, and tell what was found."""
-    from kcal.lens.rig import Origin
     from kcal.stars.detect import expand_nights
 
-    origin = None if place is None else Origin.parse(place)
-    if origin is not None and time is None:
+    if site is not None and time is None:
         raise InputError("--site without --time tells nothing: refraction depends on both")
     files = expand_nights(images)
     check_writable(output, *files)
-    views = [Night(time=time, site=origin).view(path) for path in files]
+    views = [Night(time=time, site=site).view(path) for path in files]
     found, size = camera_by_stars(files, views, "calibrating by stars", boards)
     count = sum(int(use.sum()) for use in found.lens.used)
     left_out = sum(len(use) for use in found.lens.used) - count
@@ -211,7 +213,7 @@ def _by_stars(
         warn(f"{files[number].name}: {why}")
     for text in sparse_parts(found, size):
         warn(text)
-    if origin is None:
+    if site is None:
         warn(
             "without --time and --site refraction stays in the lens: it shrinks heights by 0.03 % overhead, 0.12 % at "
             "30° of altitude and 1 % at 10°; give both"

@@ -22,7 +22,7 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.corners.circles import find_circles, refine_circles, wrong_size
 from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness
-from kcal.corners.images import VIDEO_SUFFIXES, Gray, decode_gray, expand_images, image_header, to_8bit, unique_names
+from kcal.corners.images import Gray, decode_gray, expand_images, image_header, is_video, to_8bit, unique_names
 from kcal.corners.marker_boards import MIN_CORNERS, enough, find_aprilgrid, find_charuco, free_side
 from kcal.corners.observations import Failure, Observations, View, common_size, rescaled
 from kcal.corners.recognize import (
@@ -40,7 +40,7 @@ from kcal.corners.saddle import CornerStatus, Refined
 from kcal.corners.search import SEARCH_SIDES, find_board, reduced, refine_through_sizes
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
-from kcal.files import is_stream, read_bytes, source_name
+from kcal.files import read_bytes, source_name
 from kcal.texts import brief
 
 # What the search for a board in one image gives.
@@ -494,7 +494,7 @@ def _files_and_images(paths: Any) -> list[Any]:
             raise InputError(f"images: one (H, W), a batch (B, 1, H, W) or a list is needed, got {tuple(paths.shape)}")
         return [paths] if len(paths.shape) == 2 else list(paths)
     if isinstance(paths, str | Path):
-        if is_stream(paths) or Path(paths).suffix.lower() in VIDEO_SUFFIXES:
+        if is_video(paths):
             raise InputError(f"{source_name(paths)}: a video; kcal.corners.detect_video searches its frames")
         return list(expand_images([paths]))
     found: list[Any] = []

@@ -28,7 +28,7 @@ from PIL.JpegImagePlugin import JpegImageFile
 
 from kcal.errors import FileError, InputError
 from kcal.file_kind import check_image_header, check_pixel_count, is_heif
-from kcal.files import read_bytes, read_head
+from kcal.files import is_stream, read_bytes, read_head
 
 Gray = npt.NDArray[np.uint8 | np.uint16]
 
@@ -116,6 +116,11 @@ def to_8bit(image: Gray) -> npt.NDArray[np.uint8]:
         low, high = float(image.min()), float(image.max())
     stretched = (image.astype(np.float32) - low) * (255.0 / max(high - low, 1.0))
     return np.clip(np.rint(stretched), 0, 255).astype(np.uint8)
+
+
+def is_video(source: str | Path) -> bool:
+    """Whether a source is a live stream, or a file that is a video by its suffix."""
+    return is_stream(source) or Path(source).suffix.lower() in VIDEO_SUFFIXES
 
 
 def expand_images(inputs: str | Path | Sequence[str | Path]) -> list[Path]:

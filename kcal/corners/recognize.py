@@ -455,7 +455,7 @@ def seen_instead(image: npt.NDArray[np.uint8], board: Board) -> str:
     found = seen_size(image) if plain else None
     if (circles := seen_circles(image, board, clear=found is not None)) is not None:
         return circles
-    found = found or seen_size(image)
+    found = found if plain else seen_size(image)
     own = (max(board.columns, board.rows), min(board.columns, board.rows))
     return "" if found is None or (found == own and plain) else size_advice(found, board)
 
@@ -500,8 +500,8 @@ def seen_circles(image: npt.NDArray[np.uint8], board: Board, *, clear: bool = Fa
         board: that was asked for.
         clear: most of the spots must be so round that blurred squares do not pass for circles.
     """
-    count = len(like_sized(image))
-    if count < MIN_CIRCLES or (clear and not clear_spots(image)):
+    count = len(clear_spots(image) if clear else like_sized(image))
+    if count < MIN_CIRCLES:
         return None
     if board.pattern not in ("circles", "asymmetric"):
         return f"some {count} circles were found: give --board circles:COLUMNSxROWS or asymmetric:COLUMNSxROWS"

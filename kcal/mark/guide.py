@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from kcal.calibrate.rig.pairs import pair_by_name
-from kcal.corners.images import VIDEO_SUFFIXES, Gray, decode_image, expand_images, read_gray
+from kcal.corners.images import Gray, decode_image, expand_images, is_video, read_gray
 from kcal.corners.match import MatchOptions, MatchStatus, find_again, match_points
 from kcal.corners.video import VideoFrames
 from kcal.errors import InputError
@@ -365,7 +365,7 @@ def open_pictures(left: Path, right: Path) -> Pictures:
         FileError: nothing there, or nothing that can be read.
         InputError: a video and an image, videos of different rates, or names that cannot be paired.
     """
-    videos = [path.suffix.lower() in VIDEO_SUFFIXES for path in (left, right)]
+    videos = [is_video(path) for path in (left, right)]
     if videos[0] != videos[1]:
         raise InputError(f"{left} and {right}: two images, two folders or two videos are needed")
     if videos[0]:

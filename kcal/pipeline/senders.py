@@ -336,13 +336,15 @@ def clock_text(time_s: float, start: datetime.datetime | None = None) -> str:
         >>> clock_text(1767225600.25), clock_text(12.34)
         ('2026-01-01 00:00:00 UTC', '12.3 s')
     """
+    known = calendar_time(time_s, start)
+    return f"{time_s:.1f} s" if known is None else f"{known.astimezone(datetime.UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def calendar_time(time_s: float, start: datetime.datetime | None) -> datetime.datetime | None:
+    """A time of the stream on the calendar, if it counts from `start` or in Unix seconds."""
     if start is not None:
-        moment = (start + datetime.timedelta(seconds=time_s)).astimezone(datetime.UTC)
-    elif time_s > CALENDAR:
-        moment = datetime.datetime.fromtimestamp(time_s, datetime.UTC)
-    else:
-        return f"{time_s:.1f} s"
-    return f"{moment:%Y-%m-%d %H:%M:%S} UTC"
+        return start + datetime.timedelta(seconds=time_s)
+    return datetime.datetime.fromtimestamp(time_s, datetime.UTC) if time_s > CALENDAR else None
 
 
 def _tracks(columns: PositionColumns, run: Located) -> list[dict[str, Any]]:

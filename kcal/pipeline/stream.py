@@ -31,7 +31,7 @@ from kcal.locate.tabulate import number_table
 from kcal.pipeline.estimates import TrackStates
 from kcal.pipeline.grouping import Moment
 from kcal.pipeline.imm_filter import Beliefs
-from kcal.pipeline.senders import CALENDAR, Sender
+from kcal.pipeline.senders import Sender, calendar_time
 from kcal.pipeline.tracks import Tracker, TrackRecord, Tracks
 from kcal.threads import Handover
 
@@ -593,10 +593,8 @@ class Stream:
             self.shown(columns, tracks)
 
     def _calendar(self, time: float) -> datetime.datetime:
-        if self.start is not None:
-            return self.start + datetime.timedelta(seconds=time)
-        if time > CALENDAR:
-            return datetime.datetime.fromtimestamp(time, datetime.UTC)
+        if (known := calendar_time(time, self.start)) is not None:
+            return known
         if self.senders or any(path.suffix.lower() == ".cot" for path in self.ledger.outputs):
             raise InputError(f"time {time:g} s is not in Unix seconds, which events need; give the start of the count")
         return datetime.datetime.fromtimestamp(0, datetime.UTC)
