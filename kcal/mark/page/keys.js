@@ -2,10 +2,10 @@
 import {stretchContrast} from "/page/tiles.js";
 
 const KEYS = [
-  ["N", "new target: type its name"], ["F", "new static feature"], ["[ ]", "previous, next thing"], ["Space", "mark at the middle of the image in focus"],
+  ["N", "new target: type its name"], ["F", "new static feature"], ["[ ]", "previous, next item"], ["Space", "mark at the middle of the image in focus"],
   ["Arrows", "move the mark by 0.1 px"], ["Shift+arrows", "move it by 1 px"], ["Alt+arrows", "move the image"],
   ["S", "snap the mark again"], ["Enter", "accept the proposal"], ["R", "reject it"], ["Delete", "remove the mark in this image"],
-  ["X", "other image"], ["+ −", "zoom"], ["0", "whole image"], ["Z", "20× at the selected thing"], ["I", "×10 interpolated or raw pixels"],
+  ["X", "other image"], ["+ −", "zoom"], ["0", "whole image"], ["Z", "20× at the selected item"], ["I", "×10 interpolated or raw pixels"],
   ["C", "stretch contrast to what is shown"], ["K", "linked zoom"], ["U, Ctrl+Z", "undo"], ["Ctrl+Y", "redo"], [", .", "previous, next frame"],
   ["A", "find the points of the reference again"], ["Shift+click", "mark exactly there, without snapping"], ["?", "this list"],
 ];

@@ -72,7 +72,7 @@ class App {
   }
   // Why something cannot be had now, which may change with the next landmark.
   refuse(text, solved = true) { this.say(text); this.said = solved ? "refusal" : "no rig"; }
-  // What was said of an earlier thing or rig no longer holds.
+  // What was said of an earlier item or rig no longer holds.
   settle(...kinds) { if (kinds.includes(this.said)) this.say(""); }
 
   answered(state) {
@@ -248,7 +248,7 @@ class App {
     this.select(this.items[(at + step + this.items.length) % this.items.length].name);
   }
 
-  // Place the selected thing's mark: at the shape that is there, or exactly where it was said.
+  // Place the selected item's mark: at the shape that is there, or exactly where it was said.
   async place(side, u, v, snapping = true) {
     if (!this.inside(side, u, v)) return;
     if (!this.item()) await this.add("target");
@@ -358,13 +358,13 @@ class App {
     if (!this.linked) return;
     const far = this.views[other(view.side)];
     far.scale = view.scale * far.ratio / view.ratio;
-    // Both keep what they show in their middle: the offset between them is that of the thing looked at.
+    // Both keep what they show in their middle: the offset between them is that of the point looked at.
     const target = this.partner(view, x, y);
     if (target && factor > 1) { const [u, v] = view.image(x ?? view.canvas.width / 2, y ?? view.canvas.height / 2); far.look(target[0] + view.center[0] - u, target[1] + view.center[1] - v); }
     else far.look(far.center[0] + view.center[0] - before[0], far.center[1] + view.center[1] - before[1]);
     if (scale === view.scale) far.draw();
   }
-  // Where the other image shows what is at this place: the selected thing's mark or proposal, if the place is near it.
+  // Where the other image shows what is at this place: the selected item's mark or proposal, if the place is near it.
   partner(view, x, y) {
     const side = view.side, far = other(side), mark = this.markOf(side);
     if (x === undefined || !mark) return null;
@@ -419,7 +419,7 @@ async function start() {
   app.take(await get("state"));
   if (!app.selected && app.items.length) app.select((app.items.find((item) => !item.left || !item.right) || app.items[0]).name);
   if (about.notes.length) app.say(about.notes.join("; "), true);
-  else if (app.actions.waiting.length === 0) app.say(about.cameras ? "Choose a thing in the list, or press N for a new target; click it in one image. The key ? lists all keys." : "No cameras were given: marks are snapped and saved, but no geometry helps. Start with --rig or --cameras for it.");
+  else if (app.actions.waiting.length === 0) app.say(about.cameras ? "Choose an item in the list, or press N for a new target; click it in one image. The key ? lists all keys." : "No cameras were given: marks are snapped and saved, but no geometry helps. Start with --rig or --cameras for it.");
 }
 start().catch((error) => {
   byId("status").textContent = error.message;

@@ -1,4 +1,4 @@
-// The list of things, what the selected one is worth, and what the rig promises.
+// The list of items, what the selected one is worth, and what the rig promises.
 const byId = (id) => document.getElementById(id);
 const SIGNS = {landmark: "■", target: "●", feature: "▲"};
 const meters = (value) => (value < 10 ? value.toFixed(2) : value < 100 ? value.toFixed(1) : value.toFixed(0)) + " m";
