@@ -12,7 +12,7 @@ from kcal.checks import as_points
 from kcal.dispatch import finite_or, in_chunks, is_differentiated, known_true, may_branch
 from kcal.lens.distortion import check_coefficients, distort_components, polynomial
 from kcal.lens.model import LensModel
-from kcal.lens.region import DIRECTIONS, Region, direction_limits, in_region, valid_region
+from kcal.lens.region import DIRECTIONS, SECTORS, Region, direction_limits, in_region, valid_region
 from kcal.lens.zernike import unbind_last
 
 # Newton's method in two unknowns, for the inverse of a lens: one step, and when to stop.
@@ -157,9 +157,9 @@ def undo_tilt(x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel) -> t
 # it. Points that stopped at the edge follow that line.
 
 _RINGS = 16
-# The image of the region's edge is known at 64 directions only. A target this much farther out may still be inside:
+# The image of the region's edge is known at 1024 directions only. A target this much farther out may still be inside:
 # it is tried at all, and it is tried again along the line from the axis.
-_TRIED, _TRIED_AGAIN = 1.02, 1.002
+_TRIED, _TRIED_AGAIN = 1.0001, 1.00001
 
 
 def solve_safeguarded(
@@ -196,14 +196,19 @@ def solve_safeguarded(
     radius = region.radius.expand(lead).reshape(cameras)
     edges = region.edge.expand(*lead, -1).reshape(cameras, -1)
     cuts = region.cuts.expand(*lead, -1, -1).reshape(cameras, -1, 4)
-    sample_x, sample_y, image_x, image_y = _region_samples(lenses, model, Region(radius, edges, cuts))
-    inner_x, inner_y = image_x[:, :-DIRECTIONS], image_y[:, :-DIRECTIONS]
-
-    outward = _edge_fraction(target_x, target_y, image_x, image_y)
+    whole = Region(radius, edges, cuts)
+    # Just inside the edge.
+    edge = (1 - 1e-9) * whole.outline(SECTORS)
+    outward = _edge_fraction(target_x, target_y, *_images(edge, lenses, model))
     # Negated, so that NaN is tried.
     camera, place = (~valid & ~(outward > _TRIED)).nonzero(as_tuple=True)
     if not len(camera):
         return x.reshape(shape), y.reshape(shape), valid.reshape(shape)
+    # Rings like the edge, and the axis. The edge is no start: the first Newton step from there would be wild.
+    rings = torch.arange(_RINGS + 1, dtype=torch.float64, device=lenses.device)[:, None, None] / (_RINGS + 0.5)
+    samples = (rings * whole.outline(DIRECTIONS)[:, None]).flatten(1, 2)
+    sample_x, sample_y = samples.unbind(-1)
+    image_x, image_y = _images(samples, lenses, model)
     found: list[tuple[Tensor, ...]] = []
     # A block of points at a time: their distances to all samples are one matrix.
     for c, n in zip(camera.split(1024), place.split(1024), strict=True):
@@ -212,7 +217,7 @@ def solve_safeguarded(
         goal_x, goal_y, enough = (value[c, n].reshape(tail) for value in (target_x, target_y, tolerance))
         lens = lenses[c] if cameras > 1 else lenses[0]
         here = Region(radius[c], edges[c], cuts[c]) if cameras > 1 else Region(radius[0], edges[0], cuts[0])
-        distances = (inner_x[c] - goal_x.reshape(-1, 1)) ** 2 + (inner_y[c] - goal_y.reshape(-1, 1)) ** 2
+        distances = (image_x[c] - goal_x.reshape(-1, 1)) ** 2 + (image_y[c] - goal_y.reshape(-1, 1)) ** 2
         nearest = distances.argmin(-1)
         start_x, start_y = (value[c, nearest].reshape(tail) for value in (sample_x, sample_y))
         part: tuple[Tensor, ...] = _damped_newton(start_x, start_y, goal_x, goal_y, enough, lens, model, here)
@@ -228,34 +233,25 @@ def solve_safeguarded(
     return x, y, valid
 
 
-def _region_samples(lenses: Tensor, model: LensModel, region: Region) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points of each region on rings like its edge, and their images: (cameras, 1089) each, the axis first.
-
-    The last ring lies just inside the edge. It is no start, because the first Newton step from there would be wild.
-    """
-    rings = torch.arange(1, _RINGS + 2, dtype=torch.float64, device=lenses.device) / (_RINGS + 0.5)
-    rings[-1] = 1 - 1e-9
-    points = (rings[:, None, None] * region.outline(DIRECTIONS)[:, None]).flatten(1, 2)
-    points = torch.cat([torch.zeros_like(points[:, :1]), points], 1)
-    x, y = points.unbind(-1)
-    lens = distort_components(x, y, lenses, model)
+def _images(points: Tensor, lenses: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:
+    """Images x, y (cameras, N) of points (cameras, N, 2) of each region."""
+    lens = distort_components(points[..., 0], points[..., 1], lenses, model)
     regular = lens.positive & (lens.determinant > 0)
     # Images that are no part of the lens: far enough never to be the nearest, and still finite when squared.
     far = 1e150
     image_x, image_y = (torch.where(regular, value, far).clamp(-far, far).nan_to_num(far) for value in (lens.x, lens.y))
-    return x, y, image_x, image_y
+    return image_x, image_y
 
 
-def _edge_fraction(x: Tensor, y: Tensor, image_x: Tensor, image_y: Tensor) -> Tensor:
+def _edge_fraction(x: Tensor, y: Tensor, edge_x: Tensor, edge_y: Tensor) -> Tensor:
     """Distance of targets (cameras, N) from the origin, as a fraction of that to the image of the region's edge.
 
-    The region's image is a star about the origin, so its edge, the image of the last ring, is a function of direction.
+    The region's image is a star about the origin, so its edge (cameras, 1024) is a function of direction.
     """
-    edge_x, edge_y = image_x[:, -DIRECTIONS:], image_y[:, -DIRECTIONS:]
     angle, order = torch.atan2(edge_y, edge_x).sort(-1)
     reach = torch.gather(torch.hypot(edge_x, edge_y), -1, order)
-    after = torch.searchsorted(angle, torch.atan2(y, x)) % DIRECTIONS
-    before = (after - 1) % DIRECTIONS
+    after = torch.searchsorted(angle, torch.atan2(y, x)) % SECTORS
+    before = (after - 1) % SECTORS
     limit = torch.maximum(torch.gather(reach, -1, before), torch.gather(reach, -1, after))
     return torch.hypot(x, y) / limit
 

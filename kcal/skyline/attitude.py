@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from torch import Tensor
 
 import kcal.skyline.fit as fits
@@ -61,6 +60,9 @@ def raised_horizon(horizon: Horizon, raster: Raster, eye: Origin, error: RasterE
         eye: where the camera is.
         error: of the raster; errors along a ray have the correlation exp(-d / `correlation`).
     """
+    # Here, because it takes long to load.
+    from scipy.signal import lfilter
+
     some = np.unique(np.linspace(0, len(horizon.azimuth) - 1, _AZIMUTHS).round().astype(int))
     rays = TerrainRays(raster, eye, error.refraction)
     distance = sample_distances(raster, rays)
