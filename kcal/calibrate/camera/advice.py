@@ -240,6 +240,26 @@ def direction_share(parameters: Tensor, model: LensModel, points: Tensor, covari
     return float((variance / spread).sqrt()) if float(spread) > 0 else math.inf
 
 
+class AlikeError(DegenerateError):
+    """All boards are tilted alike, as those of any part of the views then are."""
+
+
+def check_tilts(rotation: Tensor) -> None:
+    """Raise `AlikeError` where all views (V, 3, 3), cam_from_board, show the board tilted alike.
+
+    Whatever shape of the print or of the lens that tilts all of them alike is then taken for the focal length.
+    """
+    normals = torch.nn.functional.normalize(rotation[..., 2] * rotation[..., 2, 2:].sign(), dim=-1)
+    middle = torch.nn.functional.normalize(normals.sum(0), dim=0)
+    apart = float(torch.rad2deg(torch.acos((normals @ middle).clamp(max=1.0))).max())
+    if apart < _ALIKE:
+        raise AlikeError(
+            f"the board is tilted alike in all {len(rotation)} views (within {apart:.1f}° of one direction): they do "
+            "not determine the focal length, which other views of the same kind give otherwise; add views with the "
+            "board tilted by 30 to 45 degrees to the left, right, top and bottom"
+        )
+
+
 def check_directions(
     parameters: Tensor,
     model: LensModel,
@@ -261,16 +281,8 @@ def check_directions(
         names: of the views, for the message.
     """
     used = rotation.isfinite().all(-1).all(-1).nonzero()[:, 0].tolist()
-    normals = torch.nn.functional.normalize(rotation[used][..., 2] * rotation[used][..., 2, 2:].sign(), dim=-1)
-    middle = torch.nn.functional.normalize(normals.sum(0), dim=0)
-    apart = float(torch.rad2deg(torch.acos((normals @ middle).clamp(max=1.0))).max())
-    if apart < _ALIKE and float(covariance[0, 0]) > 0.0:
-        # Whatever shape of the print or of the lens that tilts all of them alike is then taken for the focal length.
-        raise DegenerateError(
-            f"the board is tilted alike in all {len(used)} views (within {apart:.1f}° of one direction): they do not "
-            "determine the focal length, which other views of the same kind give otherwise; add views with the board "
-            "tilted by 30 to 45 degrees to the left, right, top and bottom"
-        )
+    if float(covariance[0, 0]) > 0.0:
+        check_tilts(rotation[used])
     share = direction_share(parameters, model, points[seen], covariance)
     if share <= _MOST:
         return

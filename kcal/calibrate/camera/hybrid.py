@@ -16,7 +16,13 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import check_directions, roll_findings, what_to_photograph
+from kcal.calibrate.camera.advice import (
+    AlikeError,
+    check_directions,
+    check_tilts,
+    roll_findings,
+    what_to_photograph,
+)
 from kcal.calibrate.camera.checks import (
     MINIMUM_VIEWS,
     check_views,
@@ -68,6 +74,7 @@ def calibrate_hybrid(
         start = rough_start(
             board, pixels, observations.image_size, weights, options.of_fit(observations.image_size), progress
         )
+        check_tilts(start.estimate.state.rotation)
         weights = corner_weights(observations, start.residuals)
     fit = fit_by_options(observations, pixels, weights, start, options, progress)
     return hybrid_result(observations, fit, options)
@@ -225,8 +232,8 @@ def calibrate_what_fits(
             raise
         failure = error
     except DegenerateError as error:
-        # Wrong views can leave the others open, too.
-        if options.reject is None and given is None:
+        # Wrong views can leave the others open, too; but of views that are alike any part is.
+        if options.reject is None and given is None and not isinstance(error, AlikeError):
             wrong = _wrong_views(observations, options)
             if wrong and few_views(len(wrong), len(observations.views)):
                 return _without(observations, options, wrong, error, progress)
