@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 
 from kcal.files import check_picture, write_atomic
 from kcal.texts import visible
@@ -297,6 +298,12 @@ def save_picture(path: str | Path, figure: Figure) -> Path:
 def picture_bytes(figure: Figure, kind: str = "png") -> bytes:
     """A figure as PNG, SVG or PDF."""
     data = io.BytesIO()
+    if kind == "png" and isinstance(figure.canvas, FigureCanvasAgg):
+        # `savefig` draws twice.
+        figure.canvas.draw()
+        image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba()))
+        image.save(data, "png", dpi=(figure.dpi, figure.dpi))
+        return data.getvalue()
     # The same figure makes the same bytes: no file has a date, and an SVG no random names.
     with rc_context({"svg.hashsalt": "kcal"}):
         figure.savefig(data, format=kind, metadata={"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind))
