@@ -289,8 +289,9 @@ def locate_command(
         points: CSV with the columns name,left_u,left_v,right_u,right_v, or name,camera,u,v for any number of cameras;
             others are carried into GeoJSON and CSV.
         truth: True positions, name,lat,lon,height, to show errors in the table and on the maps.
-        output: File to write, .geojson, .geojsonl, .csv, .kml or .cot; may be repeated; - for the standard output.
-        format: Format of `-o -`: csv, geojson, geojsonl, kml or cot.
+        output: File to write, .geojson, .geojsonl, .csv, .kml, .cot, .parquet or .gpkg; may be repeated; - for the
+            standard output.
+        format: Format of `-o -`: csv, geojson, geojsonl, kml, cot, parquet or gpkg.
         picture: A plan and the intervals.
         map_: HTML file to write: an interactive map that needs no network.
         tiles: With --map: folder of tiles FOLDER/zoom/x/y.png to embed.

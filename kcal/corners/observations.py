@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import pydantic
 
+from kcal.arrow import ArrowRows, arrow_table
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.file_kind import ImageSize
@@ -63,7 +64,7 @@ class Failure(Record):
     reason: str
 
 
-class Observations(NativeFile):
+class Observations(ArrowRows, NativeFile):
     """All views of one camera (file kind `observations`, version 1).
 
     Args:
@@ -152,6 +153,25 @@ class Observations(NativeFile):
             [[spread or nothing for spread in view.covariance or ()] for view in self.views], dtype=torch.float64
         )
         return packed[..., [0, 1, 1, 2]].unflatten(-1, (2, 2))
+
+    def to_arrow(self, **more: Tensor) -> Any:
+        """A `pyarrow.Table` of the corners that were seen, one row each; with pyarrow, the extra `tables`.
+
+        Columns: `view`, `corner` (its number on the board), `board_x_m` and its like, `u`, `v` and, where they are
+        known, `cov_uu_px2`, `cov_uv_px2`, `cov_vv_px2`.
+
+        Args:
+            more: further numbers (V, N) of all corners, by the name of their column.
+        """
+        pixels, covariances = self.pixels(), self.covariances()
+        numbers = {"u": pixels[..., 0], "v": pixels[..., 1]}
+        if covariances is not None:
+            numbers |= {f"cov_{'uv'[i]}{'uv'[j]}_px2": covariances[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1))}
+        view, corner = pixels.isfinite().all(-1).nonzero(as_tuple=True)
+        board = {f"board_{axis}_m": self.board.points[corner, i].numpy() for i, axis in enumerate("xyz")}
+        texts = {"view": [self.names[i] for i in view.tolist()]}
+        rest = {name: value[view, corner].numpy() for name, value in (numbers | more).items()}
+        return arrow_table(texts | {"corner": corner.numpy()} | board | rest)
 
     def subset(self, names: list[str]) -> Observations:
         """The same file with only the named views, in the order given."""

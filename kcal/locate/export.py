@@ -1,4 +1,4 @@
-"""Write positions: KML, GeoJSON, Cursor on Target, CSV."""
+"""Write positions: KML, GeoJSON, Cursor on Target, CSV, GeoParquet, GeoPackage."""
 
 from __future__ import annotations
 
@@ -18,10 +18,19 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 import orjson
 
-from kcal.errors import InputError
+from kcal.errors import InputError, with_extra
 from kcal.files import open_atomic
-from kcal.locate.positions import CORNER_DECIMALS, NOWHERE, REGION_SHARE, Located, cut_at_antimeridian, ring_blocks
-from kcal.locate.stereo import PositionStatus
+from kcal.locate.positions import (
+    CORNER_DECIMALS,
+    NOWHERE,
+    OWN_FRAME,
+    REGION_SHARE,
+    STATUS_NAMES,
+    Located,
+    cut_at_antimeridian,
+    position_table,
+    ring_blocks,
+)
 from kcal.locate.tables import NUMBERS, TEXTS, PositionColumns, guarded, is_number, number_lines
 from kcal.texts import csv_line, one_line, visible
 
@@ -137,14 +146,13 @@ def camera_features(run: Located) -> list[bytes]:
 
 def point_features(columns: PositionColumns) -> Iterator[bytes]:
     """A feature for each pair of marks; its geometry is null where there is no position."""
-    statuses = {int(status): status.name.lower() for status in PositionStatus}
     infinite = set(np.flatnonzero(np.isinf(columns.numbers).any(1)).tolist())
     extras = [(column, list(map(_json_value, cells))) for column, cells in columns.extras.items()]
     rows = zip(columns.names, columns.status.tolist(), columns.reasons, columns.numbers.tolist(), strict=True)
     for place, (name, status, reason, numbers) in enumerate(rows):
         lat, lon, height = numbers[0], numbers[1], numbers[_HEIGHT]
         # JSON has neither NaN nor infinity: both become null.
-        values = ("point", name, statuses[status], reason, *numbers)
+        values = ("point", name, STATUS_NAMES[status], reason, *numbers)
         properties: dict[str, Any] = dict(zip(_PROPERTIES, values, strict=True))
         if place in infinite:
             properties |= {
@@ -282,9 +290,6 @@ STREAM = Path("-")
 _SPECIAL = re.compile(r"[^\w .:/\n-]|^[^\w.\n]", re.MULTILINE)
 # Names of properties and columns that further columns of a table must not have.
 _TAKEN = {"kind", *TEXTS, *NUMBERS}
-_STATUSES = {int(status): status.name.lower() for status in PositionStatus}
-_MOVED = {"east_m": "x_m", "north_m": "y_m", "up_m": "z_m"}
-_AXES = str.maketrans("enu", "xyz")
 
 
 class _Format(NamedTuple):
@@ -320,22 +325,16 @@ def _json_lines(run: Located, columns: PositionColumns, time: datetime) -> bytes
     return b"".join(line + b"\n" for line in lines)
 
 
-# The numbers of a rig that has no place on the Earth, by their names there: x, y and z for east, north and up.
-_OWN_FRAME = {
-    name: re.sub("cov_(..)", lambda found: f"cov_{found[1].translate(_AXES)}", _MOVED.get(name, name))
-    for name in NUMBERS
-    if not name.startswith(("lat", "lon", "height", "geoid", "cep", "azimuth", "elevation"))
-}
-_OWN_COLUMNS = [NUMBERS.index(name) for name in _OWN_FRAME]
+_OWN_COLUMNS = [NUMBERS.index(name) for name in OWN_FRAME]
 
 
 def _csv_start(run: Located, columns: PositionColumns) -> bytes:
-    numbers = NUMBERS if run.origin else ("frame", *_OWN_FRAME.values())
+    numbers = NUMBERS if run.origin else ("frame", *OWN_FRAME.values())
     return csv_line([*TEXTS, *numbers, *columns.extras]).encode()
 
 
 def _csv_rows(run: Located, columns: PositionColumns, time: datetime) -> bytes:
-    statuses = [_STATUSES[code] for code in columns.status.tolist()]
+    statuses = [STATUS_NAMES[code] for code in columns.status.tolist()]
     texts = [_csv_cells(columns.names), statuses, _csv_cells(columns.reasons)]
     numbers = columns.numbers
     if run.origin is None:
@@ -379,20 +378,72 @@ _FORMATS = {
 }
 
 
+class _Parquet:
+    """Rows of a GeoParquet file, a group of rows for each part."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._writer: Any = None
+
+    def add(self, run: Located, columns: PositionColumns) -> None:
+        from pyarrow.parquet import ParquetWriter
+
+        table = position_table(columns, run)
+        self._writer = self._writer or ParquetWriter(self._file, table.schema)
+        self._writer.write_table(table)
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+
+class _GeoPackage:
+    """Two layers of a GeoPackage: `positions`, points with all columns, and `regions`, their 95 % regions."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._folder = file, tempfile.TemporaryDirectory()
+        self._path, self._begun = Path(self._folder.name, "positions.gpkg"), False
+
+    def add(self, run: Located, columns: PositionColumns) -> None:
+        with with_extra("tables", "GeoPackage files need"):
+            from pyogrio.raw import write_arrow
+
+        table = position_table(columns, run)
+        there = table.filter(table["region"].is_valid())
+        for layer, rows, geometry, kind in (
+            ("positions", table.drop_columns("region"), "geometry", "Point Z"),
+            ("regions", there.select(["name", "region"]), "region", "MultiPolygon"),
+        ):
+            write_arrow(
+                rows, self._path, layer=layer, driver="GPKG", geometry_name=geometry, geometry_type=kind,
+                crs="EPSG:4326", append=self._begun,
+            )  # fmt: skip
+        self._begun = True
+
+    def close(self) -> None:
+        if self._begun:
+            with self._path.open("rb") as made:
+                shutil.copyfileobj(made, self._file, 1 << 20)
+        self._folder.cleanup()
+
+
+# Formats whose files are no text: written by other libraries.
+_TABLES: dict[str, type[_Parquet] | type[_GeoPackage]] = {".parquet": _Parquet, ".gpkg": _GeoPackage}
+
 # Rows of these can be appended one after another; a .cot file then lacks the end of its document.
 APPENDED = (".geojsonl", ".csv", ".cot")
 
 
 def check_place(path: str | Path, run: Located) -> None:
     """Raise `InputError` for a file of latitudes where there are none."""
-    if run.origin is None and Path(path).suffix.lower() != ".csv":
-        raise InputError(f"{path}: {NOWHERE}; or write .csv")
+    if run.origin is None and Path(path).suffix.lower() not in (".csv", ".parquet"):
+        raise InputError(f"{path}: {NOWHERE}; or write .csv or .parquet")
 
 
 def check_format(path: str | Path) -> None:
     """Raise `InputError` unless the suffix of `path` is one that `write_positions` knows."""
-    if Path(path).suffix.lower() not in _FORMATS:
-        raise InputError(f"{path}: unknown format; the file name must end with {', '.join(_FORMATS)}")
+    if Path(path).suffix.lower() not in _FORMATS | _TABLES:
+        raise InputError(f"{path}: unknown format; the file name must end with {', '.join(_FORMATS | _TABLES)}")
 
 
 def appended(suffix: str, run: Located, columns: PositionColumns, time: datetime, *, first: bool) -> bytes:
@@ -431,7 +482,9 @@ class PositionWriter:
 
     def __init__(self, file: BinaryIO, suffix: str, run: Located) -> None:
         check_place(f"positions{suffix}", run)
-        self._file, self._run, self._format = file, run, _FORMATS[suffix.lower()]
+        self._file, self._run = file, run
+        self._table = _TABLES[suffix.lower()](file) if suffix.lower() in _TABLES else None
+        self._format = _FORMATS[".csv" if self._table else suffix.lower()]
         self._later = tempfile.TemporaryFile() if self._format.later is not None else None  # noqa: SIM115
         self._started = False
         self._time = datetime.now(UTC)
@@ -442,8 +495,12 @@ class PositionWriter:
             taken = [name for name in columns.extras if name in _TAKEN or name.endswith("_infinite")]
             if taken:
                 raise InputError(f"the table has a column {taken[0]!r}, as positions have; give it another name")
-            self._file.write(self._format.start(self._run, columns))
+            if not self._table:
+                self._file.write(self._format.start(self._run, columns))
             self._started = True
+        if self._table:
+            self._table.add(self._run, columns)
+            return
         for piece in columns.pieces(_AT_ONCE):
             self._file.write(self._format.rows(self._run, piece, self._time))
             if self._later is not None and self._format.later is not None:
@@ -451,6 +508,8 @@ class PositionWriter:
 
     def close(self) -> None:
         """Write the end of the file, which stays open."""
+        if self._table:
+            self._table.close()
         if self._later is not None:
             self._later.seek(0)
             shutil.copyfileobj(self._later, self._file, 1 << 20)
@@ -482,14 +541,16 @@ def open_writers(paths: Sequence[Path], run: Located, stream_suffix: str = ".csv
 
 
 def write_positions(path: str | Path, located: Located) -> Path:
-    """Write positions, atomically, in the format of the suffix: .geojson, .json, .geojsonl, .csv, .kml or .cot.
+    """Write positions, atomically: .geojson, .json, .geojsonl, .csv, .kml, .cot, .parquet or .gpkg, by the suffix.
 
     GeoJSON follows RFC 7946: coordinates are [longitude, latitude, ellipsoidal WGS84 height in meters]. The cameras
     come first (`kind` is "camera"), then one feature for each pair of marks (`kind` is "point"), and last a polygon for
     each position (`kind` is "region"): its 95 % region, a long and slightly skewed ellipse. A pair without a position
     has a null geometry, its status and the reason. `range_high_m` is null where it is infinite, because JSON has no
     infinity; `range_high_infinite` is then true. `.geojsonl` has one feature a line, each region behind its point. In
-    CSV unknown fields are empty and an infinite range is `inf`. `.cot` is Cursor-on-Target.
+    CSV unknown fields are empty and an infinite range is `inf`. `.cot` is Cursor-on-Target. `.parquet` is GeoParquet
+    (`Located.to_arrow`) and `.gpkg` a GeoPackage with the layers `positions` and `regions`; both need the extra
+    `tables`.
 
     Raises:
         InputError: another suffix.

@@ -6,14 +6,17 @@ import dataclasses
 import functools
 import itertools
 import math
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kcal.arrow import ArrowRows, arrow_table, wkb_points, wkb_polygon
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.rig import Origin
@@ -70,7 +73,7 @@ class Position:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Located:
+class Located(ArrowRows):
     """Result of `locate_points`: one position for each pair of marks, in order, and where the rig stood.
 
     `columns` contains the positions as arrays, `positions` gives each row as a `Position`. `origin` is None, there are
@@ -134,6 +137,17 @@ class Located:
         known = [name for name in self.included if name != "marks"]
         note = "95 % of the noise in the marks" + (f" and of the errors in {' and '.join(known)}" if known else "")
         return note + (f"; errors in {' and '.join(missing)} are not included" if missing else "")
+
+    def to_arrow(self) -> Any:
+        """A `pyarrow.Table` with the columns of a CSV file, unknown numbers null; with pyarrow, the extra `tables`.
+
+        On the Earth it is a GeoParquet table: `geometry` holds points, and `region` their 95 % regions.
+
+        Example:
+            >>> import pandas, polars  # doctest: +SKIP
+            >>> pandas.DataFrame.from_arrow(located), polars.DataFrame(located)  # doctest: +SKIP
+        """
+        return position_table(self.columns, self)
 
     @property
     def count(self) -> int:
@@ -281,6 +295,49 @@ def cut_at_antimeridian(ring: Sequence[tuple[float, float]]) -> list[Ring]:
             kept = [(lat, lon + turn) for lat, lon in kept]
             sides.append([*kept, kept[0]])
     return sides
+
+
+# Positions as a table of Arrow, and on the Earth of GeoParquet 1.1: geometries are longitude, latitude, height.
+
+_MOVED = {"east_m": "x_m", "north_m": "y_m", "up_m": "z_m"}
+_AXES = str.maketrans("enu", "xyz")
+# The numbers of a rig that has no place on the Earth, by their names there: x, y and z for east, north and up.
+OWN_FRAME = {
+    name: re.sub("cov_(..)", lambda found: f"cov_{found[1].translate(_AXES)}", _MOVED.get(name, name))
+    for name in NUMBERS
+    if not name.startswith(("lat", "lon", "height", "geoid", "cep", "azimuth", "elevation"))
+}
+STATUS_NAMES = {int(status): status.name.lower() for status in PositionStatus}
+_GEO = {
+    "version": "1.1.0",
+    "primary_column": "geometry",
+    "columns": {
+        "geometry": {"encoding": "WKB", "geometry_types": ["Point Z"]},
+        "region": {"encoding": "WKB", "geometry_types": ["MultiPolygon"], "edges": "planar"},
+    },
+}
+
+
+def position_table(columns: PositionColumns, run: Located) -> Any:
+    """Some rows as `Located.to_arrow` gives all of them; with the cells of further columns as texts."""
+    texts = {"name": columns.names, "status": [STATUS_NAMES[code] for code in columns.status.tolist()]}
+    texts |= {"reason": columns.reasons}
+    if run.origin is None:
+        numbers = {own: columns.column(name) for name, own in OWN_FRAME.items()}
+        return arrow_table(texts | numbers | columns.extras, {"kcal": {"frame": run.frame}})
+    numbers = {name: columns.column(name) for name in NUMBERS}
+    places = np.stack([numbers[name] for name in ("lon", "lat", "height_ellipsoidal_m")], -1)
+    rings = (ring[:, ::-1] for block in ring_blocks(columns, run.place, plain=run.feet is not None) for ring in block)
+    regions = [wkb_polygon(_flat_rings(next(rings))) if there else None for there in columns.located.tolist()]
+    geometries = {"geometry": wkb_points(places), "region": regions}
+    about: dict[str, dict[str, Any]] = {"geo": _GEO, "kcal": {"range_interval": run.interval_note, "geoid": run.geoid}}
+    return arrow_table(texts | numbers | columns.extras | geometries, about)
+
+
+def _flat_rings(ring: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    if np.abs(ring[:, 0]).max() <= 180.0:
+        return [ring]
+    return [np.array(part)[:, ::-1] for part in cut_at_antimeridian(ring[:, ::-1].tolist())]
 
 
 # Places and fields of view as a map draws them: latitude and longitude, computed on the ellipsoid.

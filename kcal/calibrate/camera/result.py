@@ -6,11 +6,12 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
+from kcal.arrow import ArrowRows
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.hybrid.network_fit import FieldTraining
@@ -273,7 +274,7 @@ class SharedBoard:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class CameraCalibrationResult:
+class CameraCalibrationResult(ArrowRows):
     """A calibrated camera with its residuals and error bars.
 
     Args:
@@ -389,6 +390,15 @@ class CameraCalibrationResult:
             return None
         moved = self.board_points - self.observations.board.points
         return tuple((x, y, z) for x, y, z in moved.tolist())
+
+    def to_arrow(self) -> Any:
+        """The table of the observations (`kcal.Observations.to_arrow`), and `residual_u`, `residual_v`; null: left out.
+
+        Example:
+            >>> import polars  # doctest: +SKIP
+            >>> polars.DataFrame(result).group_by("view").agg(polars.col("residual_u").std())  # doctest: +SKIP
+        """
+        return self.observations.to_arrow(residual_u=self.residuals[..., 0], residual_v=self.residuals[..., 1])
 
     @property
     def board_points(self) -> Tensor:
