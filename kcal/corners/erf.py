@@ -74,18 +74,19 @@ def center_covariance(
     Returns:
         (B, N, 2, 2) px².
     """
-    gain = torch.einsum("bnij,bnjyx->bniyx", inverse, jacobian * weight[:, :, None])
+    gain = torch.einsum("bnij,bnjyx->bniyx", inverse.to(residual), jacobian * weight[:, :, None])
     outer = torch.einsum("bniyx,bnjyx->bnij", gain, gain)  # G Gᵀ
     smeared = torch.einsum("bnij,bnjyx->bniyx", outer, jacobian)
     moving, white = gain[:, :, :2], outer[..., :2, :2]
     odd, pair = _odd(residual, weight, center)
+    # (1 - J G)(1 - J G)ᵀ beside the 1 is J at one pixel times `smeared - gain` at the other, less G times J.
+    ahead, behind = torch.cat([jacobian, -gain], 2), torch.cat([smeared - gain, jacobian], 2)
 
     def found_and_made(down: int, right: int) -> tuple[Tensor, Tensor, Tensor]:
         """Weighted sums over pairs of pixels: products found, products that fitting makes of white noise, and pairs."""
         here, there = _pixel_pairs(down, right)
         both = pair[here] * pair[there]
-        # (1 - J G)(1 - J G)ᵀ beside the 1, twice: all of it is odd.
-        made = 2.0 * (both * (jacobian[here] * (smeared - gain)[there] - gain[here] * jacobian[there]).sum(-3))
+        made = 2.0 * (both * (ahead[here] * behind[there]).sum(-3))  # twice: all of it is odd
         return (both * odd[here] * odd[there]).sum((-2, -1)), made.sum((-2, -1)), both.sum((-2, -1))
 
     found, made, count = found_and_made(0, 0)
@@ -104,7 +105,7 @@ def center_covariance(
             here, there = _pixel_pairs(down, right)
             cross = torch.einsum("bniyx,bnjyx->bnij", moving[here], moving[there])
             covariance = covariance + correlation[:, None, None, None] * (cross + cross.transpose(-1, -2))
-    return noise.clamp_min(least_noise)[..., None, None] * _bounded(covariance, white)
+    return noise.clamp_min(least_noise)[..., None, None] * _bounded(covariance.double(), white.double())
 
 
 def _sum_usable(values: Tensor, usable: Tensor) -> Tensor:
@@ -164,7 +165,8 @@ MIN_RADIUS = 2.5  # pixels: fewer would not determine ten parameters
 # The next line is left out where it is more sigmas of blur from the window's rim: 3e-4 of the contrast.
 REACH = 3.5
 _FIRST_STEPS, _STEPS = 4, 20
-_CONVERGED = 1e-5  # pixels
+_CONVERGED = 1e-4  # pixels: the last step is shorter; in float64 a tenth of it
+_FLOOR = 1e-7  # of the scaled normal matrix: what float32 leaves of it
 
 
 class CrossingFit(NamedTuple):
@@ -282,40 +284,44 @@ def _levenberg_marquardt(parameters: Tensor, inputs: _FitInputs, steps: int) -> 
     damping = torch.full_like(result_cost, 1e-3)
     last = result_last.clone()
     normal, gradient, cost = _normal_equations(parameters, inputs)
+    # What rounding of the levels may do to a cost.
+    power = (inputs.window.weight * inputs.window.levels.square()).sum(-1).double()
+    rounding = torch.finfo(inputs.window.levels.dtype).eps * power.sqrt()
+    still = _CONVERGED if inputs.window.levels.dtype == torch.float32 else 0.1 * _CONVERGED
     for _ in range(steps):
         scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).rsqrt()
         scaled = normal * scale[:, :, None] * scale[:, None, :]
-        scaled = scaled + (1e-12 + damping)[:, None, None] * torch.eye(PARAMETERS, device=scaled.device)
+        scaled = scaled + (_FLOOR + damping)[:, None, None] * torch.eye(PARAMETERS, device=scaled.device)
         factor, _ = torch.linalg.cholesky_ex(scaled)
         step = -torch.cholesky_solve((gradient * scale)[..., None], factor)[..., 0] * scale
         step = torch.nan_to_num(step, posinf=0.0, neginf=0.0)
         trial = parameters + step
         trial_normal, trial_gradient, trial_cost = _normal_equations(trial, inputs)
-        better = trial_cost <= cost
+        better = trial_cost <= cost + rounding * cost.sqrt()
         length = torch.linalg.vector_norm(step[:, :2], dim=-1)
         # A rejected tiny step is rounding at the minimum; a rejected long one is not.
-        last = torch.where(better | (length < _CONVERGED), length, last)
+        last = torch.where(better | (length < still), length, last)
         parameters = torch.where(better[:, None], trial, parameters)
         normal = torch.where(better[:, None, None], trial_normal, normal)
         gradient = torch.where(better[:, None], trial_gradient, gradient)
         cost = torch.where(better, trial_cost, cost)
         damping = torch.where(better, damping * 0.1, damping * 10.0).clamp(1e-9, 1e6)
-        go = (last >= _CONVERGED).nonzero()[:, 0]
+        go = (last >= still).nonzero()[:, 0]
         if 2 * len(go) < len(at):  # go on with those that have not converged
             result[at], result_cost[at], result_last[at] = parameters, cost, last
             if not len(go):
                 break
             at, inputs = at[go], inputs.of(go)
-            parameters, normal, gradient, cost, damping, last = (
-                value[go] for value in (parameters, normal, gradient, cost, damping, last)
+            parameters, normal, gradient, cost, damping, last, rounding = (
+                value[go] for value in (parameters, normal, gradient, cost, damping, last, rounding)
             )
     result[at], result_cost[at], result_last[at] = parameters, cost, last
-    return result, result_cost, result_last < 10 * _CONVERGED
+    return result, result_cost, result_last < _CONVERGED
 
 
 def _start(window: CornerWindow) -> tuple[Tensor, Tensor]:
     """Edge directions from the asymptotes of a quadratic, then mean and contrast by linear least squares."""
-    x, y = (window.where - window.offset[:, None]).unbind(-1)
+    x, y = (window.where - window.offset[:, None].to(window.where)).unbind(-1)
     one = torch.ones_like(x)
     weight = window.weight
     design = torch.stack([one, x, y, x * x, 2.0 * x * y, y * y], -1)
@@ -338,10 +344,9 @@ def _start(window: CornerWindow) -> tuple[Tensor, Tensor]:
 
 
 def _least_squares(design: Tensor, values: Tensor, weight: Tensor) -> Tensor:
-    weighted = design * weight[..., None]
-    normal = weighted.transpose(-1, -2) @ design
-    solution, _ = torch.linalg.solve_ex(normal, weighted.transpose(-1, -2) @ values[..., None])
-    return torch.nan_to_num(solution[..., 0])
+    weighted = (design * weight[..., None]).mT
+    normal, right = weighted @ design, weighted @ values[..., None]
+    return torch.nan_to_num(torch.linalg.solve_ex(normal.double(), right.double())[0][..., 0])
 
 
 def _normal_equations(parameters: Tensor, inputs: _FitInputs) -> tuple[Tensor, Tensor, Tensor]:
@@ -351,10 +356,12 @@ def _normal_equations(parameters: Tensor, inputs: _FitInputs) -> tuple[Tensor, T
     weight, miss = prior.diagonal(), parameters - prior.value()
     residual = levels - window.levels
     weighted = jacobian * window.weight[:, None]
-    normal = weighted @ jacobian.transpose(-1, -2) + torch.diag_embed(weight)
-    gradient = (weighted @ residual[..., None])[..., 0] + weight * miss
-    cost = (window.weight * residual**2).sum(-1) + (weight * miss**2).sum(-1)
-    return normal, gradient, torch.nan_to_num(cost, nan=math.inf)
+    normal = (weighted @ jacobian.mT).double() + torch.diag_embed(weight)
+    gradient = (weighted @ residual[..., None])[..., 0].double() + weight * miss
+    cost = (window.weight * residual**2).sum(-1).double() + (weight * miss**2).sum(-1)
+    # Of a blur of 0 levels are finite, and their derivatives are not.
+    sound = torch.isfinite(cost + gradient.sum(-1))
+    return normal, gradient, torch.where(sound, cost, math.inf)
 
 
 def _noise_and_covariance(
@@ -363,7 +370,7 @@ def _noise_and_covariance(
     window, prior = inputs.window, inputs.prior
     levels, jacobian = crossing(parameters, window.where, inputs.bend, inputs.lines)
     weighted = jacobian * window.weight[:, None]
-    normal = weighted @ jacobian.transpose(-1, -2) + torch.diag_embed(prior.diagonal())
+    normal = (weighted @ jacobian.mT).double() + torch.diag_embed(prior.diagonal())
     inverse, _ = torch.linalg.inv_ex(normal)
     images = usable.shape
     residual = levels - window.levels
@@ -381,14 +388,14 @@ def _noise_and_covariance(
     by_ramp = inverse[:, :2, 7:9] * (prior.weight * prior.error)[:, None, None]
     covariance = covariance + by_ramp @ by_ramp.transpose(-1, -2)
     if inputs.lines is not None:
-        gain = inverse[:, :2] @ weighted
+        gain = inverse[:, :2].to(weighted) @ weighted
         covariance = covariance + line_covariance(parameters, window, inputs.bend, inputs.lines, gain, covariance)
     return noise, covariance
 
 
 def _with_gradient(parameters: Tensor, inputs: _FitInputs, levels: Tensor) -> Tensor:
     """The center as a function of the gray levels: at the minimum g(p, levels) = 0, so dp = -(∂g/∂p)⁻¹ ∂g."""
-    window, prior, lines = inputs.window, inputs.prior, inputs.lines
+    window, prior, lines = inputs.window.double(), inputs.prior, inputs.lines
     if lines is None:
         far = torch.full((len(parameters), 2, 2, 1), FAR, dtype=torch.float64, device=parameters.device)
         lines = LineDistances(far, torch.zeros_like(far))

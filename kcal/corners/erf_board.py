@@ -23,6 +23,7 @@ NAMES = ("dx", "dy", "angle1", "angle2", "log_blur", "mean", "contrast", "ramp_x
 PARAMETERS = len(NAMES)
 ODD = (0, 1, 7, 8)  # the parameters whose derivatives are odd functions of the offset from the corner
 _SERIES_ORDER = 5  # what is left out is below 0.1 % of the contrast for edges 50° apart
+_FAR_SIGMAS = 9.0  # of blur, where the density is 1e-18: products of smaller ones are denormal, and slow
 
 
 class LineDistances(NamedTuple):
@@ -66,41 +67,39 @@ def crossing(
         [128.0, 48.0, 208.0]
     """
     dx, dy, angle1, angle2, log_blur, mean, contrast, ramp_x, ramp_y, bow = (
-        value[..., None] for value in parameters.unbind(-1)
+        value[..., None] for value in parameters.to(where.dtype).unbind(-1)
     )
     px, py = where.unbind(-1)
-    x, y = px - dx, py - dy
-    blur = log_blur.exp()
-    profiles, by_x, by_y, by_angle = [], [], [], []
-    for i, angle in enumerate((angle1, angle2)):
-        curve = bend[..., i, None]
-        cos, sin = angle.cos(), angle.sin()
-        along, across = cos * x + sin * y, cos * y - sin * x
-        next_lines = None if lines is None else LineDistances(*(value[..., i, :, :] for value in lines))
-        scaled = (across - 0.5 * curve * (along**2 + blur**2)) / blur
-        profiles.append(_profile(scaled, curve * blur, blur, next_lines))
-        by_x.append((sin + curve * along * cos) / blur)
-        by_y.append((-cos + curve * along * sin) / blur)
-        by_angle.append(-along * (1.0 + curve * across) / blur)
-    a, b = profiles
+    x, y = (px - dx)[..., None, :], (py - dy)[..., None, :]
+    blur = log_blur.exp()[..., None, :]
+    angle = torch.stack([angle1, angle2], -2)  # from here on (..., edge, K)
+    curve, cos, sin = bend.to(where.dtype)[..., None], angle.cos(), angle.sin()
+    along, across = cos * x + sin * y, cos * y - sin * x
+    scaled = (across - 0.5 * curve * (along.square() + blur**2)) / blur
+    profile = _profile(scaled, blur, lines)
     rho = torch.cos(angle1 - angle2)
-    sign, by_a, by_b, by_blur, by_rho = _signs(a, b, rho)
-    light = contrast.detach().sign()
-    sign = sign + light * (a.margin + b.margin)
-    by_a, by_b = by_a + light * a.margin_slope, by_b + light * b.margin_slope
-    by_blur = by_blur + light * (a.margin_widening + b.margin_widening)
+    sign, slopes, widening, by_rho = _signs(profile, rho)
+    if lines is not None:
+        light = contrast.detach().sign()
+        sign = sign + light * profile.margin[0].sum(-2)
+        slopes = slopes + light[..., None] * profile.margin[1]
+        widening = widening + light * profile.margin[2].sum(-2)
+    by_blur = widening - (slopes * (scaled + curve * blur)).sum(-2)
     light_here = 1.0 + ramp_x * px + ramp_y * py
-    slope = light_here * (contrast - 2.0 * bow * sign)
-    by_a, by_b, by_rho = slope * by_a, slope * by_b, slope * by_rho * torch.sin(angle1 - angle2)
+    steep = light_here * (contrast - 2.0 * bow * sign)
+    by_rho = steep * by_rho * torch.sin(angle1 - angle2)
+    by_distance = slopes * (steep[..., None, :] / blur)
+    bent = by_distance * along * curve
+    by_angle1, by_angle2 = (by_distance * along + bent * across).unbind(-2)
     edge = 1.0 - sign * sign
     level = mean + contrast * sign + bow * edge
     jacobian = torch.stack(
         [
-            by_a * by_x[0] + by_b * by_x[1],
-            by_a * by_y[0] + by_b * by_y[1],
-            by_a * by_angle[0] - by_rho,
-            by_b * by_angle[1] + by_rho,
-            slope * by_blur,
+            (by_distance * sin + bent * cos).sum(-2),
+            (bent * sin - by_distance * cos).sum(-2),
+            -by_angle1 - by_rho,
+            by_rho - by_angle2,
+            steep * by_blur,
             light_here.expand_as(sign),
             light_here * sign,
             px * level,
@@ -113,68 +112,74 @@ def crossing(
 
 
 class _Profile(NamedTuple):
-    """The profile across one edge: its blurred sign and the terms of Mehler's series, each with its derivatives.
+    """The profiles across both edges: blurred signs and the terms of Mehler's series, each (..., edge, K).
 
-    value[0] is the sign; value[k + 1] is the density times Hermite's polynomial of degree k. `slope` is the derivative
-    with respect to the distance in sigmas, `widening` the one with respect to the logarithm of sigma.
+    Args:
+        value: the sign, then the density times Hermite's polynomials of degree 0 and on.
+        fall: minus the derivatives with respect to the distance in sigmas.
+        widening: the part of the derivatives with respect to the logarithm of sigma that is due to lines; empty
+            without.
+        margin: what the board's light margin adds, with both derivatives; empty without lines.
     """
 
     value: list[Tensor]
-    slope: list[Tensor]
+    fall: list[Tensor]
     widening: list[Tensor]
-    margin: Tensor
-    margin_slope: Tensor
-    margin_widening: Tensor
+    margin: list[Tensor]
 
 
-def _profile(scaled: Tensor, flat: Tensor, blur: Tensor, lines: LineDistances | None) -> _Profile:
-    value, slope = _profile_terms(scaled)
-    widening = [-(scaled + flat) * term for term in slope]
-    margin = margin_slope = margin_widening = torch.zeros_like(scaled)
-    for i, side in enumerate((1.0, -1.0) if lines is not None else ()):
-        assert lines is not None
-        distance, turn = lines.distance[..., i, :], lines.turn[..., i, :]
-        from_line = scaled - side * distance / blur
-        line, line_slope = _profile_terms(from_line)
+def _profile(scaled: Tensor, blur: Tensor, lines: LineDistances | None) -> _Profile:
+    value, fall = _profile_terms(scaled)
+    if lines is None:
+        return _Profile(value, fall, [], [])
+    widening = [torch.zeros_like(scaled) for _ in value]
+    margin = widening[:3]
+    for i, side in enumerate((1.0, -1.0)):
+        away, turn = side * lines.distance[..., i, :].to(scaled) / blur, lines.turn[..., i, :].to(scaled)
+        line, line_fall = _profile_terms(scaled - away)
         line[0] = line[0] + side  # 0 on the corner's side of the line
-        value = [one - turn * other for one, other in zip(value, line, strict=True)]
-        slope = [one - turn * other for one, other in zip(slope, line_slope, strict=True)]
-        widening = [one + turn * (from_line + flat) * other for one, other in zip(widening, line_slope, strict=True)]
         light = 0.5 * side * (turn == 0.5)
-        margin = margin + light * line[0]
-        margin_slope = margin_slope + light * line_slope[0]
-        margin_widening = margin_widening - light * (from_line + flat) * line_slope[0]
-    return _Profile(value, slope, widening, margin, margin_slope, margin_widening)
+        terms = line[0], -line_fall[0], -away * line_fall[0]
+        margin = [one + light * other for one, other in zip(margin, terms, strict=True)]
+        value = [one - turn * other for one, other in zip(value, line, strict=True)]
+        fall = [one - turn * other for one, other in zip(fall, line_fall, strict=True)]
+        widening = [one + turn * away * other for one, other in zip(widening, line_fall, strict=True)]
+    return _Profile(value, fall, widening, margin)
 
 
 def _profile_terms(a: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+    a = a.clamp(-_FAR_SIGMAS, _FAR_SIGMAS)
     density = torch.exp(-0.5 * a * a) * (1.0 / math.sqrt(2.0 * math.pi))
     hermite = [density, a * density]
     for k in range(1, _SERIES_ORDER):
         hermite.append(a * hermite[k] - k * hermite[k - 1])
     # The derivative of one is minus the next.
-    return [torch.erf(a * math.sqrt(0.5)), *hermite[:-1]], [2.0 * density, *(-value for value in hermite[1:])]
+    return [torch.erf(a * math.sqrt(0.5)), *hermite[:-1]], [-2.0 * density, *hermite[1:]]
 
 
-def _signs(a: _Profile, b: _Profile, rho: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def _signs(profile: _Profile, rho: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """E[sign(a + u) sign(b + v)] for standard normal u, v with correlation rho.
 
-    Followed by its derivatives with respect to a, b, the logarithm of the blur, and rho.
+    Followed by its derivatives with respect to a and b, the part of the one with respect to the logarithm of the blur
+    that is due to lines, and the one with respect to rho.
     """
-    value = a.value[0] * b.value[0]
-    by_a, by_b = a.slope[0] * b.value[0], a.value[0] * b.slope[0]
-    by_blur = a.widening[0] * b.value[0] + a.value[0] * b.widening[0]
-    by_rho = torch.zeros_like(value)
-    power = torch.full_like(rho, 4.0)
-    for k in range(1, _SERIES_ORDER + 1):
-        both = a.value[k] * b.value[k]
-        by_rho = by_rho + power * both
-        power = power * rho / k
-        value = value + power * both
-        by_a = by_a + power * a.slope[k] * b.value[k]
-        by_b = by_b + power * a.value[k] * b.slope[k]
-        by_blur = by_blur + power * (a.widening[k] * b.value[k] + a.value[k] * b.widening[k])
-    return value, by_a, by_b, by_blur, by_rho
+    value, by_rho = torch.zeros_like(profile.value[0][..., 0, :]), torch.zeros_like(rho)
+    by_a, by_b, widening = value, value, value
+    power, before = torch.ones_like(rho), torch.zeros_like(rho)
+    for k, (here, fall) in enumerate(zip(profile.value, profile.fall, strict=True)):
+        a, b = here.unbind(-2)
+        fall_a, fall_b = fall.unbind(-2)
+        shared = power * a
+        by_rho = by_rho + before * a * b if k else by_rho
+        value = value + shared * b
+        by_a = by_a - power * fall_a * b
+        by_b = by_b - shared * fall_b
+        if profile.widening:
+            wide_a, wide_b = profile.widening[k].unbind(-2)
+            widening = widening + power * (wide_a * b + a * wide_b)
+        before = power if k else torch.full_like(rho, 4.0)
+        power = before * rho / (k + 1)
+    return value, torch.stack([by_a, by_b], -2), widening, by_rho
 
 
 # Cut out the pixels around corners that an erf fit explains.
@@ -184,7 +189,7 @@ class CornerWindow:
     """The pixels around each of M corners and their weights: 1 inside the radius, falling to 0 within a pixel.
 
     Args:
-        levels: (M, K) gray levels of the pixels on a disc.
+        levels: (M, K) gray levels of the pixels on a disc; float32, unless the image is float64.
         offset: (M, 2) starts relative to the patch's middle.
         radius: (M,) pixels.
         places: (K,) indices of these pixels in a patch, row by row.
@@ -197,13 +202,17 @@ class CornerWindow:
         self.radius = radius
         self.places = places
         self.size = size
-        self.where = torch.stack([places % size, places // size], -1).to(torch.float64) - size // 2
+        self.where = torch.stack([places % size, places // size], -1).to(levels.dtype) - size // 2
         distance = torch.linalg.vector_norm(self.where - offset[:, None], dim=-1)
-        self.weight = (radius[:, None] + 0.5 - distance).clamp(0.0, 1.0)
+        self.weight = (radius[:, None] + 0.5 - distance).clamp(0.0, 1.0).to(levels.dtype)
 
     def of(self, some: Tensor) -> CornerWindow:
         """The window of some of the corners."""
         return CornerWindow(self.levels[some], self.offset[some], self.radius[some], self.places, self.size)
+
+    def double(self) -> CornerWindow:
+        """The window in float64."""
+        return CornerWindow(self.levels.double(), self.offset, self.radius, self.places, self.size)
 
     def patches(self, values: Tensor) -> Tensor:
         """Values of the pixels (..., K) as (..., P, P), 0 outside the disc."""
@@ -219,7 +228,9 @@ def cut_windows(image: Tensor, base: Tensor, offset: Tensor, radius: Tensor) -> 
     # A start lies at most half a pixel from the middle along each axis.
     places = (torch.hypot(axis[:, None].double(), axis[None].double()) < most + 1.21).flatten().nonzero()[:, 0]
     levels = cut_patches(image, base, half).flatten(-2)[:, places]
-    return CornerWindow(levels.detach(), offset, radius, places, len(axis)), levels
+    # float32 resolves 1e-7 of the levels, and a corner to 1e-6 px, in half the time.
+    kind = image.dtype if image.dtype == torch.float64 else torch.float32
+    return CornerWindow(levels.detach().to(kind), offset, radius, places, len(axis)), levels
 
 
 # Estimate from a whole board what one corner's window is too small to show: illumination and neighboring lines.
@@ -230,7 +241,6 @@ RAMP_WEIGHT = 3000.0
 UNKNOWN_RAMP = 1e-3  # share per pixel, where too few corners determine it: a third of the light over 300 pixels
 MIN_LIGHT_CORNERS = 12  # fewer do not separate a quadratic from their noise
 FAR = 1e6  # pixels: the distance of a line that is not known
-_SMALL = 1e-4  # pixels: the step of the numerical derivative with respect to a line's distance
 
 
 class RampPrior(NamedTuple):
@@ -281,7 +291,7 @@ def light_at(
     levels, _ = crossing(shape, window.where, bend, lines)
     weighted = window.weight * levels
     power = (weighted * levels).sum(-1)
-    return ((weighted * window.levels).sum(-1) / torch.where(power > 0, power, 1.0)).reshape(usable.shape)
+    return ((weighted * window.levels).sum(-1) / torch.where(power > 0, power, 1.0)).reshape(usable.shape).double()
 
 
 def light_slope(light: Tensor, place: Tensor, side: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
@@ -390,13 +400,14 @@ def line_covariance(
     """What errors of the neighboring lines add to the covariance `own`; their corners have errors of the same size."""
     levels, _ = crossing(parameters, window.where, bend, lines)
     normal = _edge_normals(parameters)
+    step = 30.0 * torch.finfo(levels.dtype).eps ** 0.5  # pixels, of a numerical derivative
     moves, normals = [], []
     for edge in (0, 1):
         for line in (0, 1):
             distance = lines.distance.clone()
-            distance[:, edge, line] += _SMALL
+            distance[:, edge, line] += step
             moved, _ = crossing(parameters, window.where, bend, LineDistances(distance, lines.turn))
-            moves.append((gain @ ((moved - levels) / _SMALL)[..., None])[..., 0])
+            moves.append((gain @ ((moved - levels) / step)[..., None])[..., 0])
             normals.append(normal[:, edge])
     added = torch.zeros_like(own)
     for _ in range(2):  # the neighbors' errors grow by it as well
