@@ -42,7 +42,8 @@ SIM_IMPORTERS = {"sim", "cli"}
 IMAGE_LIBRARIES = {"cv2", "skimage"}
 IMAGE_ROOMS = {"corners", "io"}
 MOST_LINES = 700
-# Doors name what users import, whichever room defines it, and have no floor: they import nothing but `kcal.doors`.
+# Doors name what users import, whichever room defines it, and have no floor: they import nothing but `kcal.doors`, and
+# of the rooms only the command line goes through them.
 DOORS = {stub.with_suffix(".py") for stub in PACKAGE.rglob("__init__.pyi")}
 # These two have no floor, too: one has the version besides, the other runs the command line.
 WITHOUT_FLOOR = DOORS | {PACKAGE / "__main__.py"}
@@ -102,15 +103,15 @@ def violations(module: str, source: str) -> list[str]:
         root = name.split(".")[0]
         if root == "kcal" and not may_import(here, room_of(name)):
             wrong.append(f"{module} imports {name}")
-        elif name in DOOR_NAMES:
+        elif name in DOOR_NAMES and here != "cli":
             wrong.append(f"{module} goes through the door {name}")
         if root in IMAGE_LIBRARIES and here not in IMAGE_ROOMS:
             wrong.append(f"{module} imports {root}")
     of_kcal = [
         n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and getattr(n.value, "id", None) == "kcal"
     ]
-    wrong += [f"{module} goes through the door kcal.{name}" for name in of_kcal if name in kcal.__all__]
     if here != "cli":
+        wrong += [f"{module} goes through the door kcal.{name}" for name in of_kcal if name in kcal.__all__]
         prints = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and getattr(n.func, "id", None) == "print"]
         wrong += [f"{module}:{node.lineno} prints" for node in prints]
     if (lines := len(source.splitlines())) > MOST_LINES:
@@ -228,7 +229,7 @@ def test_planted_violations_are_seen(module: str, source: str, complaint: str) -
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("kcal.cli.demo", "from kcal.sim.scene import demo_rig\nprint(1)"),
+        ("kcal.cli.demo", "import kcal\nfrom kcal.sim.scene import demo_rig\nprint(kcal.Camera(1))"),
         ("kcal.corners.detect", "import cv2\nfrom kcal.corners.board import Board\nfrom kcal.errors import InputError"),
         ("kcal.calibrate.camera.solve", "from kcal.calibrate.problem.poses import refine_poses\nfrom . import options"),
         ("kcal.sim.scene", "from kcal.lens.camera import Camera\nfrom kcal.checks import as_points"),

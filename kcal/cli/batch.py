@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import err, out, print_table, print_wrote, steps
 from kcal.cli.detect import given_board
@@ -61,11 +62,10 @@ def batch_command(
     """
     from kcal.calibrate.batch.jobs import BatchOptions, pieces, read_jobs
     from kcal.calibrate.batch.results import calibrate_batch
-    from kcal.lens.model import LensModel
 
     given = given_board(board, square)
     if model != "hybrid":
-        LensModel.named(model)
+        kcal.lens.LensModel.named(model)
     with steps("looking at the images", None):
         jobs = read_jobs(cameras, given, model, square)
     if given is None:

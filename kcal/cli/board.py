@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import out, print_wrote, steps, warn
 from kcal.cli.options import Command, Kind, declared, group_with_default
@@ -48,13 +49,12 @@ def print_command(
         output: File to write, .svg or .pdf.
         paper: Size of the paper: A5, A4, A3, A2, A1, A0, letter, legal, tabloid, or auto for as large as needed.
     """
-    from kcal.corners.board import Board
     from kcal.corners.print_board import board_sheet, to_pdf, to_svg
 
     suffix = output.suffix.lower()
     if suffix not in (".svg", ".pdf"):
         raise InputError(f"{output}: give a file name that ends in .svg or .pdf")
-    pattern = Board.parse(board, square)
+    pattern = kcal.Board.parse(board, square)
     sheet = board_sheet(pattern, paper)
     check_writable(output)
     write_atomic(output, to_svg(sheet.drawing) if suffix == ".svg" else to_pdf(sheet.drawing))
@@ -89,22 +89,19 @@ def measure_command(
         picture: Heights as colors, print errors as arrows.
     """
     from kcal.calibrate.hybrid.cameras_fit import fit_cameras
-    from kcal.calibrate.hybrid.measured_board import save_measured_board
-    from kcal.corners.observations import Observations
     from kcal.report.calibration import board_figure, board_text
-    from kcal.report.figures import save_picture
 
     check_writable(output, *observations)
-    sets = [Observations.load(path) for path in observations]
+    sets = [kcal.Observations.load(path) for path in observations]
     names = [path.name.split(".")[0] for path in observations]
     if len(set(names)) < len(names):
         names = [str(path) for path in observations]
     with steps("measuring", 2 * len(sets) if len(sets) > 1 else 1) as advance:
         found = fit_cameras(sets, names=names, advance=advance)
     board = dataclasses.replace(found.boards[0], name=output.name.split(".")[0])
-    save_measured_board(board, output)
+    kcal.calibrate.save_measured_board(board, output)
     if picture is not None:
-        save_picture(picture, board_figure(board))
+        kcal.report.save_picture(picture, board_figure(board))
     out.print(f"{board.board}, {len(board.observations)} of {len(sets)} observations: {', '.join(board.observations)}")
     for line in board_text(board):
         out.print(f"  {line}")

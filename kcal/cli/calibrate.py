@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import typer
 from rich.markup import escape
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import (
     ending_with,
@@ -35,54 +35,6 @@ if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
 
 _T = TypeVar("_T")
-
-
-# Options that name something and say a number of it; each name once.
-
-
-def option_number(text: str, option: str) -> float:
-    """A number that is part of an option."""
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"{option}: {text.strip()!r} is not a number") from None
-
-
-def by_name(texts: list[str] | None, option: str, read: Callable[[str | None, str], _T], twice: str) -> dict[str, _T]:
-    """What an option that may be repeated, `NAME=TEXT`, says of each name: `read` of the text and of what was typed."""
-    found: dict[str, _T] = {}
-    for text in texts or []:
-        name, equals, value = (part.strip() for part in text.partition("="))
-        if name in found:
-            raise InputError(f"{option} {text}: {name} {twice}")
-        found[name] = read(value if name and equals else None, f"{option} {text}")
-    return found
-
-
-def stated_settings(texts: list[str] | None, count: int) -> list[dict[str, float]]:
-    """The setting of each of some cameras, by `--setting`; empty if not given."""
-
-    def numbers(text: str | None, option: str) -> list[float]:
-        if text is None:
-            raise InputError(f"{option}: write NAME=NUMBER, for example focus=3.2")
-        return [option_number(value, option) for value in text.split(",")]
-
-    found = by_name(texts, "--setting", numbers, "is stated twice")
-    for name, values in found.items():
-        if len(values) not in (1, count):
-            raise InputError(f"--setting {name}: {len(values)} numbers for {count} cameras; give one, or one for each")
-    return [{name: values[i % len(values)] for name, values in found.items()} for i in range(count)]
-
-
-def _fixed(text: str | None, option: str) -> float | None:
-    return None if text is None else option_number(text, option)
-
-
-def _prior(text: str | None, option: str) -> tuple[float, float]:
-    mean, sign, sigma = (text or "").replace("+-", "±").partition("±")
-    if not sign:
-        raise InputError(f"{option}: write NAME=VALUE±SIGMA, for example fx=1600±5")
-    return option_number(mean, option), option_number(sigma, option)
 
 
 # What `kcal calibrate` tells of a calibration: to persons, and to programs.
@@ -137,8 +89,7 @@ def told_calibration(result: CameraCalibrationResult, beside: Path, *, reject: b
         out.print(f"left out: {100 * result.rejected_share:.2f} % of the corners")
     lines = [f"{entry.name}: {entry.reason}" for entry in result.excluded]
     print_left_out(lines, beside, f"{len(lines)} views and corners were left out")
-    for text in result.warnings:
-        warn(text)
+    warn(*result.warnings)
     for text in result.advice:
         out.print(f"next: {text}", markup=False)
     return dict(
@@ -195,7 +146,7 @@ def calibrate_command(
     reject: bool = False,
     reject_limit: Rare[Annotated[float, Kind(metavar="SHARE")]] = 0.1,
     temperature: Rare[kinds.Celsius] | None = None,
-    setting: Annotated[list[str] | None, Kind(metavar="NAME=NUMBER")] = None,
+    setting: list[kinds.Settings] | None = None,
     name: Rare[str] = "",
     model: Annotated[str, Kind(metavar="NAME")] = "hybrid",
     require: Annotated[kinds.Needs | None, Kind(panel=_USE)] = None,
@@ -205,10 +156,10 @@ def calibrate_command(
     focal: Rare[kinds.Pixels] | None = None,
     fov: Rare[kinds.Degrees] | None = None,
     board_warp: _Parametric[bool] = False,
-    fix: _Parametric[Annotated[list[str] | None, Kind(metavar="NAME[=VALUE]")]] = None,
+    fix: _Parametric[list[kinds.Fixed] | None] = None,
     tie: _Parametric[Annotated[list[str] | None, Kind(metavar="NAME=NAME")]] = None,
     free: _Parametric[Annotated[list[str] | None, Kind(metavar="NAME")]] = None,
-    prior: _Parametric[Annotated[list[str] | None, Kind(metavar="NAME=VALUE±SIGMA")]] = None,
+    prior: _Parametric[list[kinds.Prior] | None] = None,
     weak_prior: _Parametric[Annotated[float, Kind(metavar="SHARE", least=0)]] = 0.3,
     camera: _Parametric[kinds.CameraFile] | None = None,
     loss: _Parametric[Annotated[str | None, Kind(metavar="KIND")]] = None,
@@ -276,10 +227,11 @@ def calibrate_command(
         loss: Robust loss against wrong corners: huber, cauchy or tukey.
         loss_scale: Residual at which the robust loss sets in.
     """
-    from kcal.lens.model import LensModel
-
-    stood = stated_settings(setting, len(obs or [output]))
-    if obs is None and any(stood):
+    count, settings = len(obs or [output]), kinds.stated_once(setting, "--setting")
+    for key, numbers in settings.items():
+        if len(numbers) not in (1, count):
+            raise InputError(f"--setting {key}: {len(numbers)} numbers for {count} cameras; give one, or one for each")
+    if obs is None and settings:
         raise InputError("--setting: cameras of stars alone do not keep it; give observations of a board as well")
     if not obs:
         by_night(stars, time, site, output, name)
@@ -291,38 +243,33 @@ def calibrate_command(
         check_file("--board-shape", board_shape, BOARD)
     places = _camera_files(obs, output, picture, report, name)
     if model not in ("hybrid", "network"):
-        LensModel.named(model)
+        kcal.lens.LensModel.named(model)
     known = None if camera is None else calibrated_camera(camera)
 
-    from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera, calibrate_cameras
     from kcal.calibrate.camera.checks import OutlierRejection
-    from kcal.calibrate.hybrid.measured_board import load_measured_board
-    from kcal.corners.observations import Observations
-    from kcal.lens.calibration import LensSetting
-    from kcal.solve.problem import RobustLoss
 
     unknown = set(without or ()) - {"motion", "bending"}
     if unknown:
         raise InputError(f"--without {unknown.pop()}: write motion or bending")
-    options = CalibrationOptions(
+    options = kcal.CalibrationOptions(
         model=model,
         motion="motion" not in (without or ()),
         bending="bending" not in (without or ()),
         # An unknown kind is refused by the options themselves, and that of a loss by the loss.
-        board=load_measured_board(board_shape) if Path(board_shape).suffix else board_shape,  # type: ignore[arg-type]
+        board=kcal.calibrate.load_measured_board(board_shape) if Path(board_shape).suffix else board_shape,  # type: ignore[arg-type]
         board_warp=board_warp,
         focal=focal,
         field_of_view=fov,
-        fixed=by_name(fix, "--fix", _fixed, "is fixed twice"),
+        fixed=kinds.stated_once(fix, "--fix"),
         tied=tuple(tuple(name.strip() for name in text.split("=")) for text in tie or []),
         free=tuple(free or []),
-        priors=by_name(prior, "--prior", _prior, "has a prior already"),
+        priors=kinds.stated_once(prior, "--prior"),
         weak_prior=weak_prior or None,
         camera=known,
-        loss=None if loss is None else RobustLoss(kind=loss, scale=loss_scale),  # type: ignore[arg-type]
+        loss=None if loss is None else kcal.solve.RobustLoss(kind=loss, scale=loss_scale),  # type: ignore[arg-type]
         reject=OutlierRejection(limit=reject_limit) if reject else None,
     )
-    sets = [Observations.load(place.observations) for place in places]
+    sets = [kcal.Observations.load(place.observations) for place in places]
 
     def cure(error: object, i: int) -> str:
         # Where options name parameters, the views are not to blame.
@@ -331,10 +278,10 @@ def calibrate_command(
 
     with steps("calibrating", None) as advance:
         if len(sets) > 1:
-            outcomes = calibrate_cameras(sets, options, advance, one_type=one_type)
+            outcomes = kcal.calibrate.calibrate_cameras(sets, options, advance, one_type=one_type)
         else:
             with ending_with(lambda error: cure(error, 0)):
-                outcomes = [calibrate_camera(sets[0], options, advance)]
+                outcomes = [kcal.calibrate_camera(sets[0], options, advance)]
     if stars and not isinstance(outcomes[0], KcalError):
         outcomes = [joined_by_stars(outcomes[0], stars, time, site, places[0].output)]
     failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
@@ -346,14 +293,13 @@ def calibrate_command(
         if isinstance(result, KcalError):
             warn(f"{place.name}: {with_command(str(result), cure(result, places.index(place)))}")
             continue
-        stated = LensSetting(values=stood[places.index(place)]) if setting else None
+        i = places.index(place)
+        stood = {key: numbers[i % len(numbers)] for key, numbers in settings.items()}
+        stated = kcal.lens.LensSetting(values=stood) if stood else None
         source = place.observations.name
         result.save(place.output, name=place.name, source=source, temperature=temperature, setting=stated)
         if place.picture is not None:
-            from kcal.report.calibration import calibration_figure
-            from kcal.report.figures import save_picture
-
-            save_picture(place.picture, calibration_figure(result, place.name))
+            kcal.report.save_picture(place.picture, kcal.report.calibration_figure(result, place.name))
         figures[place.name] = told_calibration(
             result, place.output, reject=reject, verbose=verbose or not options.hybrid
         )

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import err, out, show_page
 from kcal.cli.detect import board_in_images, given_board
@@ -62,9 +63,7 @@ def capture_command(
     check_writable(output)
     pattern = given_board(board, square)
     if pattern is None and output.exists():
-        from kcal.corners.observations import Observations
-
-        pattern = Observations.load(output).board
+        pattern = kcal.Observations.load(output).board
     pattern = pattern or board_in_images([source], square)
     session = CaptureSession(output, pattern, CaptureOptions(until=until, most=most, refine=refine.value))
     if session.views:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import out, print_wrote, steps, tell, tell_table, warn
 from kcal.cli.inputs import calibrated_camera, single_camera
@@ -13,10 +14,6 @@ from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 from kcal.table import Table
 from kcal.texts import number_text
-
-if TYPE_CHECKING:
-    from kcal.lens.camera import Camera
-
 
 # `kcal compare`: how well lens models predict views that were held out.
 
@@ -62,12 +59,9 @@ def compare_command(
             raise InputError(f"{output}: the name of a table must end with .csv")
         check_writable(output, observations)
 
-    from kcal.calibrate.camera.at_setting import compare_models
-    from kcal.corners.observations import Observations
-
-    seen = Observations.load(observations)
+    seen = kcal.Observations.load(observations)
     with steps("comparing", parts * len(names)) as advance:
-        result = compare_models(
+        result = kcal.calibrate.compare_models(
             seen, names, groups="views" if groups == "views" else "blocks", parts=parts, progress=advance
         )
     count = len(result.corners)
@@ -86,9 +80,8 @@ def compare_command(
         write_atomic(output, table.csv)
     if picture is not None:
         from kcal.report.calibration import models_figure
-        from kcal.report.figures import save_picture
 
-        save_picture(picture, models_figure(result, observations.name))
+        kcal.report.save_picture(picture, models_figure(result, observations.name))
     print_wrote(output, picture)
     for name, reason in result.failures.items():
         warn(f"{name} could not be fitted to some of the views: {reason}")
@@ -125,13 +118,13 @@ def diff_command(
     """
     import torch
 
-    from kcal.lens.difference import camera_difference, difference_text
+    from kcal.lens.difference import difference_text
 
     cameras = [single_camera(source) for source in (first, second)]
     then, now = (_temperature(camera) for camera in cameras)
     for source, camera in zip((first, second), cameras, strict=True):
         out.print(f"{source}: {_history(camera)}", markup=False)
-    found = camera_difference(*cameras, at=distance, rotation=None if turn else torch.eye(3))
+    found = kcal.lens.camera_difference(*cameras, at=distance, rotation=None if turn else torch.eye(3))
     tell(
         at_m=None if math.isinf(distance) else distance,
         rms_px=found.rms,
@@ -148,17 +141,16 @@ def diff_command(
         out.print(line, markup=False)
     if picture is not None:
         from kcal.report.calibration import difference_figure
-        from kcal.report.figures import save_picture
 
-        print_wrote(save_picture(picture, difference_figure(found, title=f"{first} and {second}")))
+        print_wrote(kcal.report.save_picture(picture, difference_figure(found, title=f"{first} and {second}")))
 
 
-def _temperature(camera: Camera) -> float | None:
+def _temperature(camera: kcal.Camera) -> float | None:
     record = camera.calibration.record if camera.calibration else None
     return record.temperature if record else None
 
 
-def _history(camera: Camera) -> str:
+def _history(camera: kcal.Camera) -> str:
     """Model, focal length and, if the file tells, when the camera was calibrated."""
     from kcal.lens.uncertainty import paraxial_focal
 
@@ -195,21 +187,18 @@ def interpolate_command(
         output: Camera file to write.
     """
     check_writable(output, *cameras)
-    wanted = {name: stated.value for name, stated in setting}
-    if len(wanted) < len(setting):
-        raise InputError(f"--setting {' '.join(name for name, _ in setting)}: a name is stated twice")
-    spread = {name: stated.sigma for name, stated in setting if stated.sigma is not None}
+    stated = kinds.stated_once(setting, "--setting")
+    wanted = {name: one.value for name, one in stated.items()}
+    spread = {name: one.sigma for name, one in stated.items() if one.sigma is not None}
 
     from kcal.calibrate.camera.at_setting import camera_at_setting
-    from kcal.io.camera_file import load_camera, save_camera
-    from kcal.lens.calibration import LensSetting
 
-    loaded = [load_camera(path) for path in cameras]
+    loaded = [kcal.load_camera(path) for path in cameras]
     found = camera_at_setting(loaded, wanted, setting_sigma=spread, names=[str(path) for path in cameras])
-    *stated, made = [camera.calibration and camera.calibration.setting for camera in (*loaded, found.camera)]
+    *stood, made = [camera.calibration and camera.calibration.setting for camera in (*loaded, found.camera)]
     weights = [(weight, number_text(weight, 0.01, sign=True)) for weight in found.weights]
     columns = {name: name for name in ("camera", "setting", "weight")}
-    rows = list(zip(map(str, cameras), map(str, stated), weights, strict=True))
+    rows = list(zip(map(str, cameras), map(str, stood), weights, strict=True))
     tell_table("cameras", Table(columns, rows), left=(0, 1))
     parts = {
         "calibrations": found.calibration_px,
@@ -219,13 +208,13 @@ def interpolate_command(
     }
     total = sum(value**2 for value in parts.values()) ** 0.5
     how, whence = "calibrated", ""
-    if isinstance(made, LensSetting) and made.interpolated_from:
+    if isinstance(made, kcal.lens.LensSetting) and made.interpolated_from:
         by = [f"{number_text(value, digits=2)} by {name}" for name, value in parts.items() if value]
         how, whence = "interpolated", f": {', '.join(by)}"
     known = f"points at infinity ± {number_text(total, digits=2)} px (median)"
     out.print(f"{made}, {how}: {known}{whence}", markup=False)
     tell(setting=wanted, sigma_px={"median": total, **parts})
-    save_camera(found.camera, output, name=output.name.split(".")[0])
+    kcal.save_camera(found.camera, output, name=output.name.split(".")[0])
     print_wrote(output)
 
 
@@ -255,12 +244,9 @@ def bake_command(
     name = camera.name.removesuffix(".json").removesuffix(".camera")
     path = check_writable(output or camera.with_name(f"{name}_lookup.npz"), camera)
 
-    from kcal.io.lookup_file import save_lookup
-    from kcal.lens.baking import bake
-
     with steps("baking", None):
-        lookup = bake(calibrated_camera(camera), tolerance)
-    save_lookup(lookup, path)
+        lookup = kcal.lens.bake(calibrated_camera(camera), tolerance)
+    kcal.lens.save_lookup(lookup, path)
     for which, table, bound, coverage in zip(
         ("pixels to rays", "rays to pixels"),
         (lookup.chart_from_pixels, lookup.pixels_from_chart),

@@ -18,13 +18,12 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
 from rich.text import Text
 
+import kcal
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import replaced, write_atomic
 from kcal.texts import one_line, visible
 
 if TYPE_CHECKING:
-    from kcal.corners.board import Board
-    from kcal.corners.observations import Observations
     from kcal.table import Table
 
 
@@ -84,10 +83,11 @@ def _tell_more(name: str, *items: Any) -> None:
     _told.setdefault(name, []).extend(items)
 
 
-def warn(text: str) -> None:
-    """Print a warning to the error stream."""
-    _tell_more("warnings", visible(text))
-    err.print("[yellow]warning:[/]", escape(text))
+def warn(*texts: str) -> None:
+    """Print warnings to the error stream; programs are told a list of them, be it empty."""
+    _tell_more("warnings", *map(visible, texts))
+    for text in texts:
+        err.print("[yellow]warning:[/]", escape(text))
 
 
 def print_wrote(*paths: Path | None) -> None:
@@ -290,7 +290,7 @@ def with_command(text: str, cure: str) -> str:
     return f"{text.rstrip('.')}{stop} {cure}" if cure and "kcal " not in text else text
 
 
-def board_words(board: Board) -> str:
+def board_words(board: kcal.Board) -> str:
     """The options that name a board.
 
     Example:
@@ -309,7 +309,7 @@ def board_words(board: Board) -> str:
     return f"--board {':'.join(parts)} --square {_millimeters(board.square)}"
 
 
-def more_views(board: Board, observations: Path) -> str:
+def more_views(board: kcal.Board, observations: Path) -> str:
     """The command that adds views to an observations file.
 
     Example:
@@ -320,7 +320,7 @@ def more_views(board: Board, observations: Path) -> str:
     return f"To add views: kcal capture camera:0 {board_words(board)} -o {shlex.quote(str(observations))}"
 
 
-def look_at_views(seen: Observations, observations: Path) -> str:
+def look_at_views(seen: kcal.Observations, observations: Path) -> str:
     """The command that shows what was found in each image."""
     folders = {str(Path(view.image).parent) for view in seen.views if view.image is not None}
     images = shlex.join(sorted(folders)) if len(folders) == 1 else "images/"
@@ -330,7 +330,7 @@ def look_at_views(seen: Observations, observations: Path) -> str:
     return f"To look at the views: kcal detect {images} {board_words(seen.board)} -o {file} --gallery {picture}"
 
 
-def views_cure(error: object, seen: Observations, observations: Path) -> str:
+def views_cure(error: object, seen: kcal.Observations, observations: Path) -> str:
     """More views where they do not determine the camera; another look where they contradict each other."""
     if isinstance(error, DegenerateError):
         return more_views(seen.board, observations)

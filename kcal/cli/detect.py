@@ -7,19 +7,17 @@ import re
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from rich.markup import escape
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import board_words, ending_with, err, out, print_left_out, steps, tell, warn
 from kcal.cli.inputs import typed, typed_with
 from kcal.cli.options import Kind
 from kcal.errors import InputError
 from kcal.files import check_writable, is_stream, make_folder, source_name
-
-if TYPE_CHECKING:
-    from kcal.corners.board import Board
 
 
 def detect_command(
@@ -66,9 +64,8 @@ def detect_command(
     check_writable(output)
     given = given_board(board, square)
 
-    from kcal.corners.detect import Detection, detect
+    from kcal.corners.detect import Detection
     from kcal.corners.images import expand_images, is_video, turned_images
-    from kcal.corners.video import detect_video
 
     failed: list[tuple[str, Path, Detection]] = []
 
@@ -83,7 +80,7 @@ def detect_command(
         searched: list[str] = []
         pattern = given or board_in_images(images, square, time_limit)
         with steps(f"watching {streams[0]} for {duration:g} s" if streams else "searching the video", None):
-            observations = detect_video(
+            observations = kcal.corners.detect_video(
                 images[0], pattern, refine.value, progress=searched.append, time_limit=time_limit, duration=duration,
                 keep=keep,
             )  # fmt: skip
@@ -96,7 +93,7 @@ def detect_command(
             ending_with(lambda error: _next_command(str(error), board, pattern, images, paths, output)),
             steps("detecting", len(paths)) as advance,
         ):
-            observations = detect(
+            observations = kcal.detect(
                 paths,
                 pattern,
                 refine.value,
@@ -110,13 +107,12 @@ def detect_command(
     observations.save(output)
     if gallery is not None or coverage is not None:
         from kcal.report.calibration import FailedImage, coverage_figure, gallery_figure
-        from kcal.report.figures import save_picture
 
         if gallery is not None:
             tiles = [FailedImage(name, path, found.reason, found.rejected) for name, path, found in failed]
-            save_picture(gallery, gallery_figure(observations, tiles))
+            kcal.report.save_picture(gallery, gallery_figure(observations, tiles))
         if coverage is not None:
-            save_picture(coverage, coverage_figure(observations))
+            kcal.report.save_picture(coverage, coverage_figure(observations))
 
     width, height = observations.image_size
     found, unseen = len(observations.views), sum(view.pixels.count(None) for view in observations.views)
@@ -124,8 +120,7 @@ def detect_command(
     out.print(f"{escape(str(output))}: board found in {found} {source} of {width}x{height} px")
     wide, high = (1e3 * side for side in pattern.extent)
     out.print(f"board {pattern}: {wide:g} x {high:g} mm from the first point to the last")
-    for text in notes:
-        warn(text)
+    warn(*notes)
     if turned:
         out.print(
             f"note: {len(turned)} images have an EXIF rotation, of {len(paths)}, which kcal ignores: corners are in "
@@ -142,16 +137,13 @@ def detect_command(
         out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
 
 
-def given_board(size: str, square: str | None) -> Board | None:
+def given_board(size: str, square: str | None) -> kcal.Board | None:
     """The board that `--board` and `--square` say; None where the images have to tell it."""
-    from kcal.corners.board import Board
-
-    return None if size == "auto" else Board.parse(size, square)
+    return None if size == "auto" else kcal.Board.parse(size, square)
 
 
-def board_in_images(images: Sequence[str | Path], square: str | None, time_limit: float | None = None) -> Board:
+def board_in_images(images: Sequence[str | Path], square: str | None, time_limit: float | None = None) -> kcal.Board:
     """The board that images, a video or a stream show; it is said."""
-    from kcal.corners.detect import recognize_board
     from kcal.corners.images import is_video
     from kcal.corners.recognize import Recognized
     from kcal.corners.video import spread_frames
@@ -163,7 +155,7 @@ def board_in_images(images: Sequence[str | Path], square: str | None, time_limit
 
     first = images[0]
     with steps("looking for a board", None):
-        return recognize_board(
+        return kcal.corners.recognize_board(
             spread_frames(first) if is_video(first) else images, square, time_limit=time_limit, note=say
         )
 
@@ -172,7 +164,7 @@ _CURED = 6  # images that are looked at to name the board of a refusal
 
 
 def _next_command(
-    refusal: str, given: str, board: Board, images: Sequence[str], paths: Sequence[Path], output: Path
+    refusal: str, given: str, board: kcal.Board, images: Sequence[str], paths: Sequence[Path], output: Path
 ) -> str:
     """The command for images of each size, that with the board that was found, or one that draws the board."""
     if "different sizes" in refusal:

@@ -8,6 +8,7 @@ from typing import Any
 
 import orjson
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import cameras_and_rig, named_source, picked
@@ -56,13 +57,11 @@ def export_command(
     path, name = named_source(source)
     check_writable(output, path)
 
-    from kcal.calibrate.camera.export import export_cameras
-
     found, rig = cameras_and_rig(path)
     alone = name is not None or len(found.cameras) == 1
     chosen = picked(found, name, source) if alone else rig or found.cameras
     with steps("fitting what the format holds", None):
-        done = export_cameras(chosen, output, format=format, model=model)
+        done = kcal.lens.export_cameras(chosen, output, format=format, model=model)
     names = (name or found.names[0],) if alone else found.names
     for camera, model_name, misfit in zip(names, done.models, done.misfits, strict=True):
         label = f"{camera or 'camera'}: {model_name}"
@@ -76,18 +75,16 @@ def export_command(
                     f"{camera or 'camera'}: no lens model of {done.format} comes nearer; mrcal files (.cameramodel) "
                     "hold this lens, and maps for cv2.remap (.npz) its undistorted image"
                 )
-    for note in done.notes:
-        warn(note)
+    warn(*done.notes)
     if done.lost:
         out.print(f"not in the file: {', '.join(done.lost)}")
     fitted = [(camera, misfit) for camera, misfit in zip(names, done.misfits, strict=True) if misfit is not None]
     if picture is not None and fitted:
         from kcal.report.calibration import difference_figure
-        from kcal.report.figures import save_picture
 
         camera, misfit = max(fitted, key=lambda each: each[1].largest)
         title = f"{source}: {camera}" if len(names) > 1 else source
-        print_wrote(save_picture(picture, difference_figure(misfit, title=title)))
+        print_wrote(kcal.report.save_picture(picture, difference_figure(misfit, title=title)))
     elif picture is not None:
         out.print("no picture: nothing was refitted")
     print_wrote(*done.paths)
@@ -143,10 +140,9 @@ def import_command(
     if what and len(paths) > 1:
         raise InputError(f"{what} are read from one file{', with --board and --square' if board is not None else ''}")
     if board is not None:
-        from kcal.corners.board import Board
         from kcal.corners.foreign_corners import import_corners
 
-        seen = import_corners(paths[0], Board.parse(board, square), size)
+        seen = import_corners(paths[0], kcal.Board.parse(board, square), size)
         seen.save(output)
         weights = "with weights" if seen.covariances() is not None else "without weights"
         corners = sum(pixel is not None for view in seen.views for pixel in view.pixels)
@@ -160,23 +156,18 @@ def import_command(
 
 def _import_cameras(paths: list[Path], camera: str | None, output: Path, **stated: Any) -> None:
     """Read a camera, that of the name if there is one, or a rig, and write its file."""
-    from kcal.io.camera_file import save_camera
-    from kcal.io.formats import import_cameras
-    from kcal.io.rig_file import save_rig
-
-    found = import_cameras(*paths, **stated)
-    for note in found.notes:
-        warn(note)
+    found = kcal.lens.import_cameras(*paths, **stated)
+    warn(*found.notes)
     if camera is None and len(found.poses) > 2 and not found.unread:
-        save_rig(found.camera_rig(), output)
+        kcal.save_rig(found.camera_rig(), output)
         out.print(f"rig from {found.format}: {', '.join(found.names)}", markup=False)
     elif camera is None and found.is_rig() and not found.unread:
         rig = found.rig()
-        save_rig(rig, output)
+        kcal.save_rig(rig, output)
         out.print(f"rig from {found.format}: baseline {float(rig.baseline):.6g} m", markup=False)
     else:
         chosen = picked(found, camera, " ".join(map(str, paths)))
-        save_camera(chosen, output)
+        kcal.save_camera(chosen, output)
         out.print(f"camera from {found.format}: {chosen.model}, {chosen.size[0]}x{chosen.size[1]} px", markup=False)
     known = [one.calibration is not None and one.calibration.covariance is not None for one in found.cameras]
     if without := [name for name, stated in zip(found.names, known, strict=True) if not stated]:
@@ -188,12 +179,11 @@ def _import_cameras(paths: list[Path], camera: str | None, output: Path, **state
 
 
 def _import_survey(source: Path, output: Path, sigma: float | None, geoid: float | None) -> None:
-    from kcal.locate.geodesy import enu_to_geodetic
-    from kcal.locate.survey import EARTH, import_survey, places_csv
+    from kcal.locate.survey import EARTH, places_csv
 
-    survey = import_survey(source, sigma=sigma, geoid=geoid)
+    survey = kcal.rig.import_survey(source, sigma=sigma, geoid=geoid)
     assert survey.origin is not None
-    places = enu_to_geodetic(survey.points, survey.origin).tolist()
+    places = kcal.locate.enu_to_geodetic(survey.points, survey.origin).tolist()
     rows = (
         [name, f"{lat:.11f}", f"{lon:.11f}", f"{height:.5f}", level, up]
         for name, (lat, lon, height), (level, _, up) in zip(survey.names, places, survey.sigma.tolist(), strict=True)

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import kcal
 from kcal.cli.console import err, warn
 from kcal.errors import FileError, InputError
 from kcal.file_kind import WORDS, file_kind
@@ -17,8 +18,6 @@ from kcal.files import is_stream
 
 if TYPE_CHECKING:
     from kcal.io.foreign import ImportedCameras
-    from kcal.lens.camera import Camera
-    from kcal.lens.rig import Rig
 
 
 # Cameras from files of kcal or of other programs, as commands name them: FILE, or FILE:CAMERA.
@@ -32,7 +31,7 @@ def named_source(source: str) -> tuple[Path, str | None]:
     return Path(source), None
 
 
-def picked(found: ImportedCameras, name: str | None, source: str) -> Camera:
+def picked(found: ImportedCameras, name: str | None, source: str) -> kcal.Camera:
     """The only camera, or the one of that name; of a rig `left` and `right` name the cameras as well.
 
     Raises:
@@ -51,12 +50,13 @@ def picked(found: ImportedCameras, name: str | None, source: str) -> Camera:
     return found.cameras[names.index(name)]
 
 
-def cameras_and_rig(path: Path) -> tuple[ImportedCameras, Rig | None]:
+def cameras_and_rig(path: Path) -> tuple[ImportedCameras, kcal.Rig | None]:
     """The cameras of a file of any program, and the rig that they are, if they are one."""
-    from kcal.io.formats import import_cameras, recognized
+    from kcal.io.formats import recognized
     from kcal.io.rig_file import load_pair
 
-    found = _notes_said(import_cameras(path))
+    found = kcal.lens.import_cameras(path)
+    warn(*found.notes)
     if len(found.cameras) == 1:
         return found, None
     if recognized(path) == "kcal":
@@ -64,25 +64,18 @@ def cameras_and_rig(path: Path) -> tuple[ImportedCameras, Rig | None]:
     return found, found.rig() if found.is_rig() else None
 
 
-def single_camera(source: str) -> Camera:
+def single_camera(source: str) -> kcal.Camera:
     """The camera that FILE or FILE:CAMERA names."""
     path, name = named_source(source)
     # Without the readers of other programs' files, which take long to load.
     if (file_kind(path), name) in (("camera", None), ("rig", "left"), ("rig", "right")):
         return calibrated_camera(source)
-    from kcal.io.formats import import_cameras
-
-    return picked(_notes_said(import_cameras(path)), name, source)
-
-
-def _notes_said(found: ImportedCameras) -> ImportedCameras:
-    """The same, after its notes were said."""
-    for note in found.notes:
-        warn(note)
-    return found
+    found = kcal.lens.import_cameras(path)
+    warn(*found.notes)
+    return picked(found, name, source)
 
 
-def calibrated_camera(source: str | Path) -> Camera:
+def calibrated_camera(source: str | Path) -> kcal.Camera:
     """The camera of a file of kcal, or one of a rig of kcal: `rig.json:left`.
 
     Raises:
@@ -91,9 +84,7 @@ def calibrated_camera(source: str | Path) -> Camera:
     """
     path, name = named_source(str(source))
     if name is None:
-        from kcal.io.camera_file import load_camera
-
-        return load_camera(path)
+        return kcal.load_camera(path)
     if name not in ("left", "right"):
         raise InputError(f"{source}: a rig has the cameras left and right, and none named {name!r}")
     from kcal.io.rig_file import load_pair
@@ -341,7 +332,7 @@ def _unseen(text: str) -> bool:
 ASSUMED = 0.3
 
 
-def pixel_sigma_of(given: float | None, rig: Rig | None = None) -> float:
+def pixel_sigma_of(given: float | None, rig: kcal.Rig | None = None) -> float:
     """The noise of marks, px: as given, or as the rig's file states, or assumed; the last two are said."""
     sigma, note = pixel_sigma_and_source(given, rig)
     if note:
@@ -349,7 +340,7 @@ def pixel_sigma_of(given: float | None, rig: Rig | None = None) -> float:
     return sigma
 
 
-def pixel_sigma_and_source(given: float | None, rig: Rig | None = None) -> tuple[float, str]:
+def pixel_sigma_and_source(given: float | None, rig: kcal.Rig | None = None) -> tuple[float, str]:
     """The same, and what there is to say of it.
 
     Raises:

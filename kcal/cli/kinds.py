@@ -6,7 +6,7 @@ import datetime
 import math
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 from kcal import values
 from kcal.cli import inputs
@@ -18,6 +18,8 @@ from kcal.values import WithSigma
 if TYPE_CHECKING:
     from kcal.lens.rig import Origin
     from kcal.report.verdict import Requirement
+
+_T = TypeVar("_T")
 
 # Numbers with their unit. `Positive...` and `Least...` refuse others as wrong usage.
 Meters = Annotated[float, Kind(metavar="M")]
@@ -169,12 +171,51 @@ def _read_needs(text: str, _name: str) -> tuple[Requirement, ...]:
 Needs = Annotated[tuple[Any, ...], Kind(metavar="RANGE:ERROR", read=_read_needs)]
 
 
+_SETTING = "NAME=NUMBER, for example focus=3.2"
+
+
 def _read_setting(text: str, name: str) -> tuple[str, WithSigma]:
-    setting, value = values.named(text, name, "NAME=NUMBER, for example focus=3.2")
+    setting, value = values.named(text, name, _SETTING)
     return setting, values.with_sigma(value, f"{name} {setting}")
 
 
+def _read_settings(text: str, name: str) -> tuple[str, tuple[float, ...]]:
+    setting, value = values.named(text, name, _SETTING)
+    return setting, values.number_list(value, f"{name} {setting}", form=_SETTING)
+
+
+def _read_fixed(text: str, name: str) -> tuple[str, float | None]:
+    key, equals, value = (part.strip() for part in text.partition("="))
+    return key, values.number_list(value, f"{name} {key}", 1, "NAME or NAME=NUMBER")[0] if equals else None
+
+
+def _read_prior(text: str, name: str) -> tuple[str, tuple[float, float]]:
+    key, value = values.named(text, name, form := "NAME=VALUE±SIGMA, for example fx=1600±5")
+    mean, sigma = values.with_sigma(value, f"{name} {key}")
+    if sigma is None:
+        raise InputError(f"{name} {text!r}: write {form}")
+    return key, (mean, sigma)
+
+
 Setting = Annotated[tuple[str, WithSigma], Kind(metavar="NAME=NUMBER[±SIGMA]", read=_read_setting)]
+Settings = Annotated[tuple[str, tuple[float, ...]], Kind(metavar="NAME=NUMBER", read=_read_settings)]
+Fixed = Annotated[tuple[str, Any], Kind(metavar="NAME[=VALUE]", read=_read_fixed)]
+Prior = Annotated[tuple[str, Any], Kind(metavar="NAME=VALUE±SIGMA", read=_read_prior)]
+
+
+def stated_once(given: list[tuple[str, _T]] | None, option: str) -> dict[str, _T]:
+    """What an option that may be repeated says of each name.
+
+    Raises:
+        InputError: a name that is stated twice.
+    """
+    found: dict[str, _T] = {}
+    for name, value in given or ():
+        if name in found:
+            raise InputError(f"{option}: {name} is stated twice")
+        found[name] = value
+    return found
+
 
 # Files that are read: what they must be.
 RigFile = Annotated[Path, inputs.RIG]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import err, on_signals, steps
 from kcal.cli.inputs import pixel_sigma_of
@@ -22,13 +23,10 @@ from kcal.files import check_writable
 from kcal.texts import measured_text
 
 if TYPE_CHECKING:
-    from kcal.lens.rig import Rig
-    from kcal.locate.localizer import Localizer
     from kcal.locate.tables import PositionColumns
-    from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.senders import LiveMap
     from kcal.pipeline.stream import Stream, StreamCounts
-    from kcal.pipeline.tracks import Tracker, Tracks
+    from kcal.pipeline.tracks import Tracks
     from kcal.pipeline.video_source import Videos
 
 
@@ -96,18 +94,14 @@ def live_command(
         compile: Translate the filter to C++ first, which takes minutes; for many targets.
         start: Calendar time of second 0, if times are not Unix seconds; for events.
     """
-    from kcal.io.rig_file import load_rig
     from kcal.locate.points import PointLocator
-    from kcal.pipeline.association import AssociationOptions
     from kcal.pipeline.grouping import read_moment
-    from kcal.pipeline.measurements import ClockPrior
     from kcal.pipeline.senders import sender_to
     from kcal.pipeline.stream import Stream, lines_of
-    from kcal.pipeline.tracks import Tracker, TrackOptions
 
     if (detections is None) == (not videos):
         raise typer.BadParameter("give videos and --detector, or --detections")
-    known = load_rig(rig)
+    known = kcal.load_rig(rig)
     names = known.names
     if videos and (len(videos) != len(names) or detector is None):
         raise typer.BadParameter(f"{len(names)} videos, of the cameras {', '.join(names)}, and --detector are needed")
@@ -119,21 +113,21 @@ def live_command(
     lines = Path(detections) if detections not in (None, "-") else None
     for path in output:
         check_writable(path, rig, *([lines] if lines else []), *(videos or []))
-    clock = ClockPrior(offset_s=clock_offset, offset_sigma_s=clock_sigma, drift_sigma=clock_sigma / 3600.0)
-    joining = AssociationOptions(box_sigma=box_sigma)
+    clock = kcal.track.ClockPrior(offset_s=clock_offset, offset_sigma_s=clock_sigma, drift_sigma=clock_sigma / 3600.0)
+    joining = kcal.track.AssociationOptions(box_sigma=box_sigma)
     localize = _localizer(rig, known, options, many=many)
     solved = localize if many else localize.rig
 
     if compile:
         err.print("compiling: some three minutes the first time")
-    follow = TrackOptions.for_video(match_sigma) if videos else None
+    follow = kcal.track.TrackOptions.for_video(match_sigma) if videos else None
     moments, moving = None, 0
     if options.history is not None:
         from kcal.watch.watcher import MORE_ERRORS, Followed
 
         # The rig as it stands at each second, by a history that grows, and how many errors more that has.
         moments, moving = Followed(options.history, localize), MORE_ERRORS
-    tracker = Tracker(localize, follow, clock=clock, compiled=compile, moments=moments, moving=moving)
+    tracker = kcal.track.Tracker(localize, follow, clock=clock, compiled=compile, moments=moments, moving=moving)
     frames = _videos(videos, detector, solved, tracker, joining, match_sigma) if videos and detector else None
     source = frames or lines_of(lines, lambda line: read_moment(line, solved, joining, float(localize.pixel_sigma)))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
@@ -204,9 +198,8 @@ def summary(counts: StreamCounts) -> str:
     return "; ".join(parts)
 
 
-def _localizer(path: Path, rig: Rig, options: LocateOptions, *, many: bool) -> Localizer:
+def _localizer(path: Path, rig: kcal.Rig, options: LocateOptions, *, many: bool) -> kcal.Localizer:
     """Of two cameras, or of many."""
-    from kcal.locate.localizer import Localizer
     from kcal.locate.stations import stations_of
 
     if not many:
@@ -216,15 +209,15 @@ def _localizer(path: Path, rig: Rig, options: LocateOptions, *, many: bool) -> L
         raise InputError(
             f"{path}: this rig has no place on the Earth; solve it with landmarks or positions with latitudes"
         )
-    return Localizer(known, weights="all", pixel_sigma=pixel_sigma_of(options.pixel_sigma, known))
+    return kcal.Localizer(known, weights="all", pixel_sigma=pixel_sigma_of(options.pixel_sigma, known))
 
 
 def _videos(
     videos: list[str],
     detector: str,
-    rig: Rig | Localizer,
-    tracker: Tracker,
-    options: AssociationOptions,
+    rig: kcal.Rig | kcal.Localizer,
+    tracker: kcal.track.Tracker,
+    options: kcal.track.AssociationOptions,
     match_sigma: float,
 ) -> Videos:
     with with_extra("video", "videos need"):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import kcal
 from kcal.cli import console, kinds
 from kcal.cli.console import err, json_asked, out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_and_source
@@ -22,9 +23,6 @@ from kcal.texts import one_line
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from kcal.lens.rig import Rig
-    from kcal.locate.localizer import Localizer
-    from kcal.locate.marks import Marks
     from kcal.locate.points import PointLocator
     from kcal.locate.positions import Located
     from kcal.locate.tables import PositionColumns
@@ -32,7 +30,7 @@ if TYPE_CHECKING:
     # Positions; where bearings count from, of several cameras; whether the table states the noise of its marks; and how
     # far it has been read.
     LocatedPart = tuple[PositionColumns, Tensor | None, bool, int]
-    Locate = Callable[[Marks], tuple[PositionColumns, Tensor | None]]
+    Locate = Callable[[kcal.locate.Marks], tuple[PositionColumns, Tensor | None]]
 
 
 # What `kcal locate` prints and draws of positions.
@@ -137,15 +135,10 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[PointLocato
         by which it is located; what locates it, part by part; and where the noise of marks is from, to be said if the
         table does not state it.
     """
-    from kcal.io.rig_file import load_rig
-    from kcal.lens.rig import RigCovariance
-    from kcal.locate.localizer import Localizer
     from kcal.locate.marks import is_long, read_mark_chunks
     from kcal.locate.points import PointLocator
-    from kcal.locate.raster import terrain
-    from kcal.locate.tabulate import find_geoid
 
-    solved = load_rig(rig)
+    solved = kcal.load_rig(rig)
     stated = own.height is not None or own.terrain is not None
     many = stated or is_long(points) or len(solved) != 2 or not solved.in_first_frame
     if many:
@@ -153,14 +146,13 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[PointLocato
     elif own.aged is not None and own.history is not None:
         raise typer.BadParameter("--aged guesses what --history tells: give either")
     noise, note = pixel_sigma_and_source(own.pixel_sigma, solved)
-    for text in solved.calibration.warnings if solved.calibration else ():
-        warn(f"{rig}: {text}")
+    warn(*(f"{rig}: {text}" for text in (solved.calibration.warnings if solved.calibration else ())))
     by_moments: Locate | None = None
-    geoid = find_geoid(own.geoid_grid)
+    geoid = kcal.locate.find_geoid(own.geoid_grid)
     if many:
-        ground = None if own.terrain is None else terrain(own.terrain, own.geoid)
+        ground = None if own.terrain is None else kcal.locate.terrain(own.terrain, own.geoid)
         locate = PointLocator(
-            Localizer(solved, weights="all", pixel_sigma=noise), geoid=geoid, ground=ground,
+            kcal.Localizer(solved, weights="all", pixel_sigma=noise), geoid=geoid, ground=ground,
             height=own.height if ground is None else (0.0, own.terrain_sigma),
         )  # fmt: skip
     else:
@@ -171,7 +163,7 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[PointLocato
 
             if solved.covariance is None:
                 # Not exact: moments add what is not known of them.
-                solved.covariance = RigCovariance.of(solved)
+                solved.covariance = kcal.rig.RigCovariance.of(solved)
             by_moments = located_at(own.history, solved, lambda rig: PointLocator(localize(rig), geoid=geoid))
         locate = PointLocator(localize(solved), geoid=geoid)
 
@@ -194,7 +186,7 @@ def _refuse_of_pairs(own: LocateOptions) -> None:
         raise typer.BadParameter("--height and --terrain both say where a point that one camera saw stands: give one")
 
 
-def pair_localizer(solved: Rig, own: LocateOptions, noise: float) -> Callable[[Rig], Localizer]:
+def pair_localizer(solved: kcal.Rig, own: LocateOptions, noise: float) -> Callable[[kcal.Rig], kcal.Localizer]:
     """What makes a localizer of two cameras as they were solved, or as they stand at another time.
 
     Args:
@@ -202,7 +194,6 @@ def pair_localizer(solved: Rig, own: LocateOptions, noise: float) -> Callable[[R
         own: where it stands, if not as its file says, and what errors come on top.
         noise: of marks, px.
     """
-    from kcal.locate.localizer import Localizer
     from kcal.locate.mounting import run_errors
     from kcal.locate.tabulate import true_from_grid
 
@@ -217,12 +208,12 @@ def pair_localizer(solved: Rig, own: LocateOptions, noise: float) -> Callable[[R
         azimuth = true_from_grid(azimuth, site.origin, own.grid)
     refraction, refraction_sigma = own.refraction or (None, None)
 
-    def localize(standing: Rig) -> Localizer:
+    def localize(standing: kcal.Rig) -> kcal.Localizer:
         errors = run_errors(
             standing, yaw_deg=yaw_sigma, heading_deg=heading.sigma or 0.0 if heading else 0.0,
             origin_m=site.sigma or 0.0 if site else 0.0, elsewhere=site is not None,
         )  # fmt: skip
-        return Localizer(
+        return kcal.Localizer(
             standing, weights="marks", origin=None if site is None else site.origin, heading_deg=azimuth,
             pitch_deg=own.pitch, roll_deg=own.roll, pixel_sigma=noise, calibration=errors.calibration,
             mounting=errors.mounting, link=errors.link, refraction=refraction, refraction_sigma=refraction_sigma,
@@ -317,7 +308,7 @@ def locate_command(
         if path != STREAM:
             check_writable(path, rig, points, *filter(None, [truth]))
     if map_ is not None:
-        from kcal.report.map_page import check_map_format, save_map
+        from kcal.report.map_page import check_map_format
 
         check_map_format(map_)
         check_writable(map_)
@@ -348,13 +339,12 @@ def locate_command(
                 located = sample.located(locate)
                 true = None if truth is None else read_truth(truth, located)
             if picture is not None:
-                from kcal.report.figures import save_picture
-                from kcal.report.positions import positions_figure, stations_figure
+                from kcal.report.positions import stations_figure
 
-                draw = positions_figure if located.feet is None else stations_figure
-                save_picture(picture, draw(located, true))
+                draw = kcal.report.positions_figure if located.feet is None else stations_figure
+                kcal.report.save_picture(picture, draw(located, true))
             if map_ is not None:
-                save_map(map_, located, true, tiles=tiles, image=image, online=online)
+                kcal.report.save_map(map_, located, true, tiles=tiles, image=image, online=online)
         except KeyboardInterrupt:
             kept = ", ".join(map(str, written)) or "nothing"
             err.print(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import err, out, show_page, warn
 from kcal.cli.inputs import IMAGES, pixel_sigma_of
@@ -66,7 +67,6 @@ def mark_command(
         from kcal.mark.server import marking_app
         from kcal.web.serving import LocalServer
 
-    from kcal.io.camera_file import load_camera
     from kcal.io.rig_file import load_pair
     from kcal.mark.guide import Reference, open_pictures
     from kcal.mark.marking_service import Desk
@@ -78,7 +78,7 @@ def mark_command(
         raise InputError("--reference and --reference-images belong together: old marks, and the images they are in")
     pictures = open_pictures(left, right)
     known = None if rig is None else load_pair(rig)
-    own = None if cameras is None else (load_camera(cameras[0]), load_camera(cameras[1]))
+    own = None if cameras is None else (kcal.load_camera(cameras[0]), kcal.load_camera(cameras[1]))
     old = None if reference is None or reference_images is None else Reference(reference, *reference_images)
     session = Session(output, landmarks, pixel_sigma_of(pixel_sigma, known), targets)
     desk = Desk(pictures, session, own, known, old)
@@ -88,8 +88,7 @@ def mark_command(
         show_page(server.address, "marking page", browser=browser)
         if session.version:
             err.print(f"continued after {session.version} actions in {session.files.log}", markup=False)
-        for note in (*session.notes, *filter(None, [session.trouble])):
-            warn(note)
+        warn(*session.notes, *filter(None, [session.trouble]))
         server.run()
     finally:
         desk.close()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import typer
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import err, out, print_wrote
 from kcal.cli.options import Several
@@ -16,9 +16,6 @@ from kcal.cli.stations import camera_names, print_stands
 from kcal.errors import InputError
 from kcal.files import check_writable
 from kcal.values import WithSigma
-
-if TYPE_CHECKING:
-    from kcal.lens.rig import Mounting
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -37,14 +34,12 @@ class TypedStands:
     pitch: Several[kinds.MeasuredDegrees] | None = None
     roll: Several[kinds.MeasuredDegrees] | None = None
 
-    def mountings(self, count: int) -> list[Mounting]:
+    def mountings(self, count: int) -> list[kcal.rig.Mounting]:
         """Of so many cameras.
 
         Raises:
             InputError: another number of values, or an angle without ±.
         """
-        from kcal.locate.stations import stated_mounting
-
         site, heading, pitch, roll = self.site or [], self.heading or [], self.pitch or [], self.roll
         if roll is None:
             roll = [WithSigma(0.0, one.sigma) for one in pitch]
@@ -57,7 +52,7 @@ class TypedStands:
             if vague := [one for one in given if one.sigma is None and option != "--site"]:
                 raise InputError(f"{option} {vague[0]}: say how well it is known, for example {vague[0]}±1")
         return [
-            stated_mounting(
+            kcal.rig.stated_mounting(
                 place.origin,
                 heading_deg=(turn.value, turn.sigma or 0.0),
                 pitch_deg=(rise.value, rise.sigma or 0.0),
@@ -97,8 +92,7 @@ def place_command(
     needed = (stands.site, stands.heading, stands.pitch)
     if (places is None) == any(value is None for value in needed) or (places and (stands.roll or any(needed))):
         raise typer.BadParameter("give --site, --heading and --pitch of each camera, or all of them in --places")
-    from kcal.io.rig_file import save_rig
-    from kcal.locate.stations import read_stands, station_rig
+    from kcal.locate.stations import read_stands
 
     names = camera_names(cameras)
     if places is None:
@@ -106,8 +100,8 @@ def place_command(
     else:
         poses = read_stands(places, None if len(names) == 1 else names)
     lenses = load_cameras(cameras * len(poses) if len(cameras) == 1 else cameras)
-    rig = station_rig(dict(zip(poses, lenses, strict=True)), [*poses.values()])
-    save_rig(rig, output)
+    rig = kcal.rig.station_rig(dict(zip(poses, lenses, strict=True)), [*poses.values()])
+    kcal.save_rig(rig, output)
     print_stands(rig)
     print_wrote(output)
     out.print(

@@ -10,10 +10,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from rich.markup import escape
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import err, out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import cameras_and_rig, named_source, single_camera
@@ -21,12 +22,6 @@ from kcal.cli.options import Kind
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, dump_json, make_folder, read_bytes, write_atomic
 from kcal.strict_json import read_json
-
-if TYPE_CHECKING:
-    from kcal.lens.camera import Camera
-    from kcal.lens.images import StereoRectification, Undistort
-    from kcal.lens.rig import Rig
-
 
 _T = TypeVar("_T")
 
@@ -64,7 +59,7 @@ def _done_before(journal: Path, view: str) -> dict[str, list[int]]:
     return content["done"] if fits else {}
 
 
-def _view_key(module: Undistort) -> str:
+def _view_key(module: kcal.lens.Undistort) -> str:
     values = [value.tolist() for value in (module.camera.params, module.new_camera.params, module.rotation)]
     kinds = repr((type(module.new_camera).__name__, str(module.camera.model), module.camera.model.hybrid))
     text = repr((values, kinds, module.camera.size, module.new_camera.size, module.at))
@@ -77,7 +72,7 @@ def _file_state(path: Path) -> list[int]:
 
 
 def convert_images(
-    paths: list[Path], targets: list[Path], module: Undistort, advance: Callable[[str], None]
+    paths: list[Path], targets: list[Path], module: kcal.lens.Undistort, advance: Callable[[str], None]
 ) -> tuple[int, list[str]]:
     """Resample images into files, a bad one not stopping the others.
 
@@ -118,7 +113,7 @@ def convert_images(
     return before, failures
 
 
-def _convert(path: Path, target: Path, module: Undistort) -> None:
+def _convert(path: Path, target: Path, module: kcal.lens.Undistort) -> None:
     import torch
 
     from kcal.corners.images import decode_image
@@ -208,7 +203,7 @@ def rectify_command(
         _rectify_rig(rig, images or [], output, view)
 
 
-def rig_of(source: str) -> Rig | None:
+def rig_of(source: str) -> kcal.Rig | None:
     """The rig of a file of kcal or of another program; None for a camera."""
     path, name = named_source(source)
     return cameras_and_rig(path)[1] if name is None else None
@@ -216,8 +211,11 @@ def rig_of(source: str) -> Rig | None:
 
 @contextmanager
 def _resampled(
-    folder: Path, images: dict[Path, list[Path]], extras: list[Path], make: Callable[[], tuple[_T, list[Undistort]]]
-) -> Iterator[tuple[_T, list[Undistort]]]:
+    folder: Path,
+    images: dict[Path, list[Path]],
+    extras: list[Path],
+    make: Callable[[], tuple[_T, list[kcal.lens.Undistort]]],
+) -> Iterator[tuple[_T, list[kcal.lens.Undistort]]]:
     """Resample the images of each camera, and say it; meanwhile the other files are written. Fail last.
 
     Args:
@@ -266,23 +264,25 @@ def _rectify_camera(source: str, images: list[str], folder: Path, options: ViewO
     camera_path = folder / f"{name}_rectified.json"
     extras = [*([] if options.cylinder else [camera_path]), *_extra_paths(folder, name, options)]
 
-    from kcal.io.camera_file import save_camera
-    from kcal.lens.images import Undistort
-    from kcal.lens.views import cylinder_view, looking, new_pinhole, pinhole_view
+    from kcal.lens.views import new_pinhole
 
     old = single_camera(source)
 
-    def make() -> tuple[Any, list[Undistort]]:
+    def make() -> tuple[Any, list[kcal.lens.Undistort]]:
         fov, size = options.fov, options.size
         if options.cylinder:
-            view: Any = cylinder_view(old, fov, size)
+            view: Any = kcal.lens.cylinder_view(old, fov, size)
         else:
-            view = new_pinhole(old, options.alpha, size) if fov is None else pinhole_view(fov, size or old.size)
-        return view, [Undistort(old, view, looking(*look) if any(look) else None, at=options.distance)]
+            view = (
+                new_pinhole(old, options.alpha, size) if fov is None else kcal.lens.pinhole_view(fov, size or old.size)
+            )
+        return view, [
+            kcal.lens.Undistort(old, view, kcal.lens.looking(*look) if any(look) else None, at=options.distance)
+        ]
 
     with _resampled(folder, sides, extras, make) as (view, (module,)):
         if not options.cylinder:
-            save_camera(view, camera_path, name=f"{name} rectified")
+            kcal.save_camera(view, camera_path, name=f"{name} rectified")
         _write_extras(folder, name, module, options)
         if options.cylinder:
             focal, cx, cy = view.params.tolist()
@@ -293,7 +293,7 @@ def _rectify_camera(source: str, images: list[str], folder: Path, options: ViewO
         _tell_view(old, module, "")
 
 
-def _rectify_rig(rig: Rig, images: list[str], folder: Path, options: ViewOptions) -> None:
+def _rectify_rig(rig: kcal.Rig, images: list[str], folder: Path, options: ViewOptions) -> None:
     from kcal.corners.images import expand_images
 
     if len(images) not in ((0, 2) if options.maps else (2,)):
@@ -306,18 +306,14 @@ def _rectify_rig(rig: Rig, images: list[str], folder: Path, options: ViewOptions
 
     import torch
 
-    from kcal.io.rig_file import save_rig
-    from kcal.lens.images import StereoRectification
-    from kcal.lens.rig import Rig
-
-    def make() -> tuple[StereoRectification, list[Undistort]]:
-        made = StereoRectification(
+    def make() -> tuple[kcal.lens.StereoRectification, list[kcal.lens.Undistort]]:
+        made = kcal.lens.StereoRectification(
             rig, alpha=options.alpha, size=options.size, field_of_view=options.fov, at=options.distance
         )
         return made, [made.left, made.right]
 
     with _resampled(folder, sides, extras, make) as (both, modules):
-        save_rig(Rig.pair(both.camera, both.camera, torch.eye(3), -both.right_center), rig_path)
+        kcal.save_rig(kcal.Rig.pair(both.camera, both.camera, torch.eye(3), -both.right_center), rig_path)
         _save_array(matrix_path, both.depth_matrix)
         focal, _, cx, cy = both.camera.params[:4].tolist()
         out.print(f"both cameras: focal length {focal:.2f} px, cx {cx:.2f}, cy {cy:.2f}, baseline {rig.baseline:.6g} m")
@@ -333,7 +329,7 @@ def _extra_paths(folder: Path, name: str, options: ViewOptions) -> list[Path]:
     return [*found, *([folder / f"{name}_mask.png"] if options.mask else [])]
 
 
-def _write_extras(folder: Path, name: str, module: Undistort, options: ViewOptions) -> None:
+def _write_extras(folder: Path, name: str, module: kcal.lens.Undistort, options: ViewOptions) -> None:
     """Maps (2, H, W) for cv2.remap, (1, H, W, 2) for grid_sample with align_corners=True, and the mask."""
     import torch
 
@@ -356,7 +352,7 @@ def _save_array(path: Path, values: Any) -> None:
     write_atomic(path, data.getvalue())
 
 
-def _tell_view(camera: Camera, module: Undistort, label: str) -> None:
+def _tell_view(camera: kcal.Camera, module: kcal.lens.Undistort, label: str) -> None:
     """Print what the new image shows, what is cut, and what the entrance pupil does."""
     from kcal.lens.views import pupil_shift, shown_by
 
@@ -379,7 +375,7 @@ def _tell_view(camera: Camera, module: Undistort, label: str) -> None:
     tell(**{label.removesuffix(": ") or "view": told})
 
 
-def _tell_side(module: StereoRectification) -> None:
+def _tell_side(module: kcal.lens.StereoRectification) -> None:
     """Print what a disparity is; warn where a matcher must be told so."""
     right, down = module.right_center.tolist()[:2]
     line, sign = ("column" if abs(right) > abs(down) else "row"), ("positive" if right + down > 0 else "negative")
@@ -402,12 +398,11 @@ def _tell_side(module: StereoRectification) -> None:
         )
 
 
-def _tell_ranges(module: StereoRectification) -> None:
+def _tell_ranges(module: kcal.lens.StereoRectification) -> None:
     """Print what a disparity means in the middle of the image."""
     import torch
 
     from kcal.locate.budget import usual_ranges
-    from kcal.locate.disparity import DisparityRanges
 
     focal, _, cx, cy = module.camera.params[:4].tolist()
     width, height = module.camera.size
@@ -417,7 +412,9 @@ def _tell_ranges(module: StereoRectification) -> None:
     ranges = usual_ranges(module.rig)
     apart = float(module.right_center[:2].sum())
     disparity = focal * apart * ahead / torch.tensor(ranges, dtype=torch.float64)
-    found = DisparityRanges(module, disparity_sigma=_DISPARITY_SIGMA).at(where.expand(len(ranges), 2), disparity)
+    found = kcal.locate.DisparityRanges(module, disparity_sigma=_DISPARITY_SIGMA).at(
+        where.expand(len(ranges), 2), disparity
+    )
     rows = [["range, m", "disparity, px", f"sigma, m, of ± {_DISPARITY_SIGMA} px", "95 % from", "to"]]
     for i, at in enumerate(ranges):
         cells = (found.sigma[i], found.low[i], found.high[i])
@@ -456,7 +453,7 @@ def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.Output
     import numpy as np
     import torch
 
-    from kcal.lens.camera_like import CameraRays, ray_error
+    from kcal.lens.camera_like import ray_error
     from kcal.lens.uncertainty import paraxial_focal
 
     rig = rig_of(sources[0]) if len(sources) == 1 else None
@@ -465,7 +462,7 @@ def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.Output
     if rig is not None:
         viewmats[1, :3, :3], viewmats[1, :3, 3] = rig.right_from_left_rotation, rig.right_from_left_translation
     with steps("rays", 2) as advance:
-        module = CameraRays(cameras)
+        module = kcal.lens.CameraRays(cameras)
         advance("rounding")
         error = max(ray_error(camera, own) for camera, own in zip(cameras, module(), strict=True))
         advance("writing")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import out, print_wrote, steps, tell
 from kcal.cli.inputs import CAMERA_OR_RIG, pixel_sigma_of, single_camera
@@ -20,12 +21,10 @@ from kcal.files import check_writable
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
+    from kcal.calibrate.camera.result import CameraCalibrationResult
     from kcal.calibrate.rig.result import RigResult
     from kcal.finding import Finding
-    from kcal.lens.camera import Camera
-    from kcal.lens.rig import Rig
-    from kcal.report.verdict import Requirement, Verdict
+    from kcal.report.verdict import Verdict
 
 # A verdict, how the pictures of its page are drawn, and its tables.
 Judged: TypeAlias = "tuple[Verdict, Callable[[], dict[str, bytes]], list[list[list[str]]]]"
@@ -129,7 +128,7 @@ def warned_of(result: RigResult) -> list[Finding]:
 
 
 def _of_camera(
-    path: Path, observations: list[Path], needs: tuple[Requirement, ...], baseline: float, mark_sigma: float
+    path: Path, observations: list[Path], needs: tuple[kcal.report.Requirement, ...], baseline: float, mark_sigma: float
 ) -> Judged:
     from kcal.report.judge_camera import stored_verdict
     from kcal.report.pages import camera_tables
@@ -147,23 +146,21 @@ def _of_camera(
 
 def judged(
     result: CameraCalibrationResult,
-    options: CalibrationOptions,
-    needs: tuple[Requirement, ...],
+    options: kcal.CalibrationOptions,
+    needs: tuple[kcal.report.Requirement, ...],
     *,
     baseline: float = 10.0,
     mark_sigma: float,
     name: str,
-    stored: Camera | None = None,
+    stored: kcal.Camera | None = None,
 ) -> Judged:
     """The verdict on a calibration, with the pictures and tables of its page; `stored` as in `camera_verdict`."""
-    from kcal.calibrate.camera.trust import examine
-    from kcal.report.judge_camera import camera_verdict
     from kcal.report.pages import camera_tables
     from kcal.report.verdict_pictures import camera_pictures
 
     with steps(f"checking {name}", None) as advance:
-        examination = examine(result, options, advance)
-    verdict = camera_verdict(
+        examination = kcal.calibrate.examine(result, options, advance)
+    verdict = kcal.report.camera_verdict(
         result, options, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name, examination=examination,
         stored=stored,
     )  # fmt: skip
@@ -171,25 +168,23 @@ def judged(
 
 
 def calibrated_again(
-    camera: Camera, observations: Path, what: str
-) -> tuple[CameraCalibrationResult, CalibrationOptions]:
+    camera: kcal.Camera, observations: Path, what: str
+) -> tuple[CameraCalibrationResult, kcal.CalibrationOptions]:
     """A camera of a file, calibrated once more from its views: files have no residuals and no poses."""
-    from kcal.calibrate.camera.calibrate import calibrate_camera
     from kcal.calibrate.camera.trust import stored_options
-    from kcal.corners.observations import Observations
 
-    seen, options = Observations.load(observations), stored_options(camera)
+    seen, options = kcal.Observations.load(observations), stored_options(camera)
     check_views_of([camera], [seen], [observations])
     with steps(what, None) as advance:
-        return calibrate_camera(seen, options, advance), options
+        return kcal.calibrate_camera(seen, options, advance), options
 
 
-def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...], pixel_sigma: float | None) -> Judged:
-    from kcal.corners.observations import Observations
-    from kcal.io.rig_file import load_rig
+def _of_rig(
+    path: Path, observations: list[Path], needs: tuple[kcal.report.Requirement, ...], pixel_sigma: float | None
+) -> Judged:
     from kcal.report.judge_rig import named_cameras
 
-    rig = load_rig(path)
+    rig = kcal.load_rig(path)
     pair = rig.is_pair and rig.names == ("left", "right")
     mark_sigma = pixel_sigma_of(pixel_sigma, rig)
     cameras = named_cameras(rig)
@@ -199,25 +194,23 @@ def _of_rig(path: Path, observations: list[Path], needs: tuple[Requirement, ...]
         cameras = [cameras[number] for number in cameras_of_files(observations, [name for name, _ in cameras])]
     if observations:
         check_views_of(
-            [camera for _, camera in cameras], [Observations.load(file) for file in observations], observations
+            [camera for _, camera in cameras], [kcal.Observations.load(file) for file in observations], observations
         )
     return judged_rig(rig, observations, needs, mark_sigma=mark_sigma, name=path.name.split(".")[0], cameras=cameras)
 
 
 def judged_rig(
-    rig: Rig, observations: Sequence[Path], needs: tuple[Requirement, ...], *, mark_sigma: float,
-    name: str, cameras: Sequence[tuple[str, Camera]],
+    rig: kcal.Rig, observations: Sequence[Path], needs: tuple[kcal.report.Requirement, ...], *, mark_sigma: float,
+    name: str, cameras: Sequence[tuple[str, kcal.Camera]],
 ) -> Judged:  # fmt: skip
     """The verdict on a rig and, with the observations of `cameras`, each with its name, on these as well."""
-    from kcal.report.judge_rig import rig_verdict
-
     found = judged_sides(cameras, observations, mark_sigma)
     # Views of a rig that was solved without pairs may be of different moments, though their images are named alike.
     if observations and len(rig) == 2 and (rig.calibration is None or rig.calibration.pairs > 0):
         pairs, unpaired = _pairs(rig, observations)
     else:
         pairs, unpaired = None, ""
-    verdict = rig_verdict(
+    verdict = kcal.report.rig_verdict(
         rig, needs, mark_sigma=mark_sigma, pairs=pairs, unpaired=unpaired, cameras=[one[0] for one in found],
         subject=name,
     )  # fmt: skip
@@ -226,7 +219,7 @@ def judged_rig(
 
 
 def judged_sides(
-    cameras: Sequence[tuple[str, Camera]], observations: Sequence[Path], mark_sigma: float
+    cameras: Sequence[tuple[str, kcal.Camera]], observations: Sequence[Path], mark_sigma: float
 ) -> list[Judged]:
     """The verdicts on cameras of a rig, calibrated again from their observations; none without these."""
     found = []
@@ -238,7 +231,7 @@ def judged_sides(
     return found
 
 
-def stored_tables(rig: Rig) -> list[list[list[str]]]:
+def stored_tables(rig: kcal.Rig) -> list[list[list[str]]]:
     """Tables of all cameras, as the rig's file has them."""
     from kcal.report.judge_rig import named_cameras
     from kcal.report.pages import camera_tables
@@ -251,14 +244,13 @@ def side_pictures(cameras: Sequence[Judged]) -> dict[str, bytes]:
     return {f"{verdict.subject}-{name}": data for verdict, pictures, _ in cameras for name, data in pictures().items()}
 
 
-def _pairs(rig: Rig, observations: Sequence[Path]) -> tuple[tuple[Tensor, Tensor] | None, str]:
+def _pairs(rig: kcal.Rig, observations: Sequence[Path]) -> tuple[tuple[Tensor, Tensor] | None, str]:
     """Corners of the board and pixels of pairs of views, or why there are none."""
-    from kcal.calibrate.rig.pairs import pair_by_name, paired_boards
-    from kcal.corners.observations import Observations
-
-    left, right = (Observations.load(file) for file in observations)
+    left, right = (kcal.Observations.load(file) for file in observations)
     try:
-        boards = paired_boards((rig.left, rig.right), (left, right), pair_by_name(left.names, right.names))
+        boards = kcal.rig.paired_boards(
+            (rig.left, rig.right), (left, right), kcal.rig.pair_by_name(left.names, right.names)
+        )
     except InputError as error:
         return None, str(error)
     return (boards.points, boards.pixels), ""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import typer
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import err, out, print_table, print_wrote, warn
 from kcal.cli.inputs import pixel_sigma_and_source, pixel_sigma_of
@@ -20,9 +21,6 @@ from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 
 if TYPE_CHECKING:
-    from kcal.calibrate.rig.landmarks import Landmarks
-    from kcal.lens.rig import Rig
-    from kcal.locate.marks import Marks
     from kcal.watch.turned import Drift
 
 
@@ -93,12 +91,10 @@ def solve_command(
         board_warp: Also estimate how the board bends.
         picture: a plan, and residuals.
     """
-    from kcal.calibrate.rig.solve import RigOptions
-
     pixel_sigma_and_source(sources.pixel_sigma)
     if not sources.given:
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
-    options = RigOptions(
+    options = kcal.RigOptions(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=sources.refraction.value,
         refraction_sigma=sources.refraction_sigma,
     )  # fmt: skip
@@ -151,8 +147,7 @@ def check(
         relock: Rig file to write if it has turned; an old one of that name is kept.
     """
     from kcal.io.rig_file import load_pair
-    from kcal.locate.marks import read_marks
-    from kcal.watch.turned import check_rig, seen_again
+    from kcal.watch.turned import seen_again
 
     if reference is None and landmarks is None:
         raise InputError("give --reference (marks of the same points in old images) or --landmarks (a survey)")
@@ -162,10 +157,10 @@ def check(
         check_writable(relock, marks, *filter(None, (reference, landmarks)))
     old = load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, old)
-    now = read_marks(marks, single=True)
-    features = None if reference is None else seen_again(read_marks(reference, single=True), now, noise)
+    now = kcal.locate.read_marks(marks, single=True)
+    features = None if reference is None else seen_again(kcal.locate.read_marks(reference, single=True), now, noise)
     surveyed = None if landmarks is None else _landmarks(old, landmarks, now, noise)
-    drift = check_rig(old, features=features, landmarks=surveyed)
+    drift = kcal.rig.check_rig(old, features=features, landmarks=surveyed)
     print_turns(drift, f"{sum(item.used for item in drift.items)} of {len(drift.items)}")
     _print_effect(drift)
     for item in drift.left_out:
@@ -188,12 +183,12 @@ def check(
     raise typer.Exit(DRIFTED)
 
 
-def _landmarks(rig: Rig, path: Path, now: Marks, sigma: float) -> Landmarks:
-    from kcal.locate.survey import match_landmarks, read_survey
+def _landmarks(rig: kcal.Rig, path: Path, now: kcal.locate.Marks, sigma: float) -> kcal.Landmarks:
+    from kcal.locate.survey import read_survey
 
     if rig.mounting is None:
         raise InputError("the rig file does not say where the rig stands; solve it with landmarks, or use --reference")
-    return match_landmarks(read_survey(path, rig.mounting.origin), now, now.sigmas(sigma)).landmarks
+    return kcal.rig.match_landmarks(read_survey(path, rig.mounting.origin), now, now.sigmas(sigma)).landmarks
 
 
 def print_turns(drift: Drift, used: str = "") -> None:
@@ -217,10 +212,8 @@ def now_stamp() -> str:
     return datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
 
 
-def replace_rig(path: Path, new: Rig) -> None:
+def replace_rig(path: Path, new: kcal.Rig) -> None:
     """Write a corrected rig; a file of that name is kept beside it."""
-    from kcal.io.rig_file import save_rig
-
     # The old one first: whatever happens in between, there is a good rig.
     if path.exists():
         numbers = itertools.chain([""], itertools.count(-2, -1))
@@ -228,7 +221,7 @@ def replace_rig(path: Path, new: Rig) -> None:
         kept = next(name for name in names if not name.exists())
         write_atomic(kept, path.read_bytes())
         out.print(f"kept the old rig as {kept}", markup=False)
-    save_rig(new, path)
+    kcal.save_rig(new, path)
     print_wrote(path)
 
 

@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kcal.cli.console import aligned, err, steps, warn
+import kcal
+from kcal.cli.console import aligned, steps, warn
 from kcal.cli.inputs import typed_with
 from kcal.cli.rig_options import Sources
 from kcal.cli.stars import Night
@@ -19,14 +20,9 @@ from kcal.texts import measured_text
 from kcal.values import named, with_sigma
 
 if TYPE_CHECKING:
-    from kcal.calibrate.rig.measured import Baseline, MeasuredPosition
     from kcal.calibrate.rig.result import RigResult
-    from kcal.calibrate.rig.sources import RigData
-    from kcal.corners.observations import Observations
     from kcal.lens.calibration import CalibrationRecord
-    from kcal.lens.camera import Camera
-    from kcal.lens.rig import Origin
-    from kcal.skyline.attitude import SkylineAttitude, SkylineImage
+    from kcal.skyline.attitude import SkylineAttitude
     from kcal.stars.night import NamedStars
 
 
@@ -39,17 +35,17 @@ def _add_tracks(read: RigReading, files: tuple[Path, Path]) -> None:
     Raises:
         InputError: tables in another kind of frame; nothing to match.
     """
-    from kcal.locate.moving import CLOCK, MovingOptions, match_moving, read_sightings, read_tracks
+    from kcal.locate.moving import CLOCK
 
     given, names = read.given, list(read.cameras)
-    tracks, frame = read_tracks(files[0], read.origin)
+    tracks, frame = kcal.rig.read_tracks(files[0], read.origin)
     if (read.positions or read.placed) and frame != read.origin:
         raise InputError(f"{files[0]}: it has latitudes, the landmarks or positions local meters; give a --site")
-    options = MovingOptions(
+    options = kcal.rig.MovingOptions(
         clock_sigma=given.tracks_clock, between_sigma=given.clock_sigma, pixel_sigma=given.marks_sigma
     )
-    sightings = read_sightings(files[1], names)
-    found = match_moving(tracks, sightings, list(read.cameras.values()), names, read.positions, options)
+    sightings = kcal.rig.read_sightings(files[1], names)
+    found = kcal.rig.match_moving(tracks, sightings, list(read.cameras.values()), names, read.positions, options)
     wrong = [one for one in found.identities if one.track != one.label]
     unknown = [one for one in wrong if one.track is None]
     read.notes.append(
@@ -86,9 +82,8 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     Raises:
         InputError: nothing tells a length, or images without partners or with too little in common.
     """
-    from kcal.calibrate.rig.pairs import pair_by_name
     from kcal.corners.images import expand_images, read_gray
-    from kcal.scene.match import ImagePair, match_scene, scene_of
+    from kcal.scene.match import match_scene, scene_of
 
     first, second = read.cameras.values()
     # One position alone tells no length; GNSS of both does.
@@ -100,13 +95,13 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     given = [*images_by_camera("--scene", words, list(read.cameras)).values()]
     files = [{path.name: path for path in expand_images(list(one))} for one in given]
     named = [list(own) for own in files]
-    chosen = [(named[0][0], named[1][0])] if len(named[0]) == len(named[1]) == 1 else pair_by_name(*named)
+    chosen = [(named[0][0], named[1][0])] if len(named[0]) == len(named[1]) == 1 else kcal.rig.pair_by_name(*named)
     if not chosen:
         raise InputError(f"--scene: no image of {given[0][0]} belongs to one of {given[1][0]}; name pairs alike")
     pairs, found, refused = [], [], list[str]()
     with steps("matching the scene", len(chosen)) as advance:
         for left, right in chosen:
-            pair = ImagePair(left, read_gray(files[0][left]), read_gray(files[1][right]))
+            pair = kcal.rig.ImagePair(left, read_gray(files[0][left]), read_gray(files[1][right]))
             try:
                 found.append(match_scene((first, second), pair))
                 pairs.append(pair)
@@ -115,8 +110,7 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
             advance(left)
     if not pairs:
         raise InputError(f"--scene: {refused[0]}")
-    for text in refused:
-        warn(f"{text}; left out")
+    warn(*(f"{text}; left out" for text in refused))
     features, counts = scene_of((first, second), pairs, found)
     rows: list[tuple[str, ...]] = [("scene", "matched", "no texture", "off the line", "moved", "thinned", "used")]
     rows += [
@@ -146,8 +140,7 @@ def _add_stars(read: RigReading, words: Sequence[str]) -> None:
     """
     import torch
 
-    from kcal.calibrate.rig.measured import MeasuredPosition
-    from kcal.stars.rig_stars import moments_of, star_source
+    from kcal.stars.rig_stars import moments_of
 
     night, cameras, positions = read.given, read.cameras, read.positions
     given = images_by_camera("--stars", words, tuple(cameras))
@@ -163,9 +156,9 @@ def _add_stars(read: RigReading, words: Sequence[str]) -> None:
     if on_earth and not read.placed and not positions:
         there = torch.zeros(3, dtype=torch.float64)
         known = night.site.sigma if night.site and night.site.sigma is not None else _PLACE_SIGMA
-        positions = (MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, known)),)
+        positions = (kcal.MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, known)),)
     frame = read.origin if read.placed or positions else None
-    source = star_source(
+    source = kcal.stars.star_source(
         moments, list(cameras.values()), clock_sigma=night.clock_sigma, drift_sigma=night.clock_drift, origin=frame
     )
     named = int(source.named.sum())
@@ -222,7 +215,7 @@ def images_by_camera(option: str, words: Sequence[str], names: Sequence[str]) ->
 
 def _named_images(side: str, given: list[str], read: RigReading) -> list[NamedStars]:
     from kcal.stars.detect import expand_nights, read_night
-    from kcal.stars.night import clock_doubts, name_stars
+    from kcal.stars.night import clock_doubts
 
     files, night = expand_nights(given), read.given
     found: list[NamedStars] = []
@@ -235,16 +228,14 @@ def _named_images(side: str, given: list[str], read: RigReading) -> list[NamedSt
         for path in files:
             view = taken.view(path)
             try:
-                image = name_stars(read_night(path), read.cameras[side], view)
+                image = kcal.stars.name_stars(read_night(path), read.cameras[side], view)
             except KcalError as error:
                 warn(f"{side} {path.name}: {error}; left out")
             else:
-                for text in image.warnings:
-                    warn(f"{side} {path.name}: {text}")
+                warn(*(f"{side} {path.name}: {text}" for text in image.warnings))
                 found.append(image)
             advance(path.name)
-    for number, text in clock_doubts(found):
-        warn(f"{side}, image {number + 1} with names: {text}")
+    warn(*(f"{side}, image {number + 1} with names: {text}" for number, text in clock_doubts(found)))
     if not found:
         raise InputError(f"--stars: in none of the {len(files)} images of {side} stars have names")
     return found
@@ -262,16 +253,13 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
     import torch
 
     from kcal.corners.images import expand_images, read_gray
-    from kcal.locate.raster import terrain
-    from kcal.skyline.attitude import SkylineImage, skyline_source
-    from kcal.skyline.horizon import RasterError
 
     given, names = read.given, list(read.cameras)
     words = given.skyline or given.scene
     if not words:
         raise InputError("--terrain needs images of the skyline: --skyline IMAGES, or NAME=IMAGES for each camera")
     images = [
-        SkylineImage(name=f"{name} {path.name}", camera=names.index(name), image=read_gray(path))
+        kcal.rig.SkylineImage(name=f"{name} {path.name}", camera=names.index(name), image=read_gray(path))
         for name, own in images_by_camera("--skyline", words, names).items()
         for path in expand_images(own)
     ]
@@ -289,24 +277,25 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
         known = {} if given.terrain_sigma is None else {
             "sigma": given.terrain_sigma, "offset": 0.5 * given.terrain_sigma,
         }  # fmt: skip
-        error = RasterError(refraction=given.refraction.value, refraction_sigma=given.refraction_sigma, **known)
-        source, found = skyline_source(
-            images, list(read.cameras.values()), terrain(raster, given.geoid or 0.0), read.origin, centers, sigma,
-            error=error,
+        error = kcal.rig.RasterError(
+            refraction=given.refraction.value, refraction_sigma=given.refraction_sigma, **known
+        )
+        source, found = kcal.rig.skyline_source(
+            images, list(read.cameras.values()), kcal.locate.terrain(raster, given.geoid or 0.0), read.origin,
+            centers, sigma, error=error,
         )  # fmt: skip
     if given.skyline_picture is not None:
-        from kcal.report.figures import save_picture
         from kcal.report.rig import skyline_figure
 
-        save_picture(given.skyline_picture, skyline_figure([(image.name, image.image) for image in images], found))
+        kcal.report.save_picture(
+            given.skyline_picture, skyline_figure([(image.name, image.image) for image in images], found)
+        )
     read.notes += [line for image, one in zip(images, found, strict=True) for line in _lines(image, names, one)]
-    for image, one in zip(images, found, strict=True):
-        for text in one.warnings:
-            warn(f"skyline {image.name}: {text}")
+    warn(*(f"skyline {image.name}: {text}" for image, one in zip(images, found, strict=True) for text in one.warnings))
     read.add("skyline", source)
 
 
-def _lines(image: SkylineImage, names: Sequence[str], found: SkylineAttitude) -> list[str]:
+def _lines(image: kcal.rig.SkylineImage, names: Sequence[str], found: SkylineAttitude) -> list[str]:
     heading, pitch, roll = found.sigma_deg.tolist()
     shares = ", ".join(f"{name} {100 * share[0]:.0f} %" for name, share in found.shares.items() if share[0] > 0.005)
     second = "" if math.isnan(found.second_deg) else (
@@ -325,7 +314,7 @@ def _lines(image: SkylineImage, names: Sequence[str], found: SkylineAttitude) ->
 _SIDE = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 
 
-def check_sides(cameras: Sequence[Camera], paths: Sequence[Path]) -> None:
+def check_sides(cameras: Sequence[kcal.Camera], paths: Sequence[Path]) -> None:
     """Refuse a left camera that is named right, and a right one that is named left.
 
     Raises:
@@ -340,7 +329,7 @@ def check_sides(cameras: Sequence[Camera], paths: Sequence[Path]) -> None:
         )
 
 
-def check_views_of(cameras: Sequence[Camera], seen: Sequence[Observations], paths: Sequence[Path]) -> None:
+def check_views_of(cameras: Sequence[kcal.Camera], seen: Sequence[kcal.Observations], paths: Sequence[Path]) -> None:
     """Refuse views of another size than their camera's, and those that the other camera was calibrated from.
 
     Raises:
@@ -370,7 +359,7 @@ def check_views_of(cameras: Sequence[Camera], seen: Sequence[Observations], path
             raise InputError(_other_size(camera, views, path))
 
 
-def _other_size(camera: Camera, views: Observations, path: Path) -> str:
+def _other_size(camera: kcal.Camera, views: kcal.Observations, path: Path) -> str:
     name = camera.calibration.name if camera.calibration else ""
     return (
         f"{path}: images of {views.image_size[0]}x{views.image_size[1]} px, but the camera {name or 'given'} has "
@@ -405,10 +394,10 @@ class RigReading:
         pixel_sigma: px, the typical noise of marks along an axis, where the file of the marks states it.
     """
 
-    cameras: dict[str, Camera]
+    cameras: dict[str, kcal.Camera]
     names: tuple[str, ...]
     given: Sources
-    origin: Origin | None
+    origin: kcal.Origin | None
     sources: dict[str, Any] = dataclasses.field(default_factory=dict)
     notes: list[str] = dataclasses.field(default_factory=list)
     tellers: list[Callable[[RigResult], list[str]]] = dataclasses.field(default_factory=list)
@@ -416,7 +405,7 @@ class RigReading:
     pixel_sigma: float | None = None
 
     @property
-    def positions(self) -> tuple[MeasuredPosition, ...]:
+    def positions(self) -> tuple[kcal.MeasuredPosition, ...]:
         """Measured positions of the cameras."""
         return self.sources.get("positions", ())
 
@@ -441,25 +430,21 @@ class RigReading:
         ]
 
     @functools.cached_property
-    def data(self) -> RigData:
+    def data(self) -> kcal.RigData:
         """Everything in one frame."""
-        from kcal.calibrate.rig.sources import RigData
-
-        return RigData(cameras=tuple(self.cameras.values()), names=tuple(self.cameras), **self.sources)
+        return kcal.RigData(cameras=tuple(self.cameras.values()), names=tuple(self.cameras), **self.sources)
 
     def told(self, result: RigResult) -> list[str]:
         """What there is to say once the rig is solved."""
         return [*self.one_camera, *self.notes, *(line for tell in self.tellers for line in tell(result))]
 
 
-def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[Baseline, ...]:
+def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[kcal.Baseline, ...]:
     """`"10.02±0.005"`, meters, of two cameras; of more `"mill:mast=812.40±0.02"`, several with commas.
 
     Raises:
         InputError: something else, or a camera that is not there.
     """
-    from kcal.calibrate.rig.measured import Baseline
-
     found = []
     for part in text.split(","):
         pair, equals, measured = part.strip().rpartition("=")
@@ -476,66 +461,61 @@ def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[Baseline
                 f"baseline {part!r}: of {len(names)} cameras write FIRST:SECOND=LENGTH±SIGMA, the names being "
                 f"{', '.join(names)}"
             )
-        found.append(Baseline(first=names.index(ends[0]), second=names.index(ends[1]), length=length, sigma=sigma))
+        found.append(kcal.Baseline(first=names.index(ends[0]), second=names.index(ends[1]), length=length, sigma=sigma))
     return tuple(found)
 
 
 def _add_positions(read: RigReading, path: Path) -> None:
     """Places of the cameras."""
-    from kcal.locate.survey import camera_positions, import_survey
+    from kcal.locate.survey import camera_positions
 
     given = read.given
-    placed = import_survey(path, read.origin, sigma=given.survey_sigma, geoid=given.geoid)
+    placed = kcal.rig.import_survey(path, read.origin, sigma=given.survey_sigma, geoid=given.geoid)
     read.origin = placed.origin
     read.add("positions", camera_positions(placed, tuple(read.cameras)))
 
 
 def _add_landmarks(read: RigReading, path: Path) -> None:
     """Surveyed places with their marks."""
-    from kcal.locate.marks import read_marks
-    from kcal.locate.survey import import_survey, match_landmarks
-
     given = read.given
     assert given.marks is not None
-    survey = import_survey(path, read.origin, sigma=given.survey_sigma, geoid=given.geoid)
+    survey = kcal.rig.import_survey(path, read.origin, sigma=given.survey_sigma, geoid=given.geoid)
     if given.positions is not None and survey.origin != read.origin:
         raise InputError("landmarks and positions: one has latitudes, the other local meters; give a --site")
     read.origin = survey.origin
-    marks = read_marks(given.marks, read.names, single=True, others=len(read.cameras) == 1)
-    found = match_landmarks(survey, marks, marks.sigmas(given.marks_sigma))
+    marks = kcal.locate.read_marks(given.marks, read.names, single=True, others=len(read.cameras) == 1)
+    found = kcal.rig.match_landmarks(survey, marks, marks.sigmas(given.marks_sigma))
     if marks.covariance is not None:
         read.pixel_sigma = marks.typical_sigma(given.marks_sigma)
     read.add("landmarks", found.landmarks)
-    for some, text in ((found.unmarked, "surveyed, but not marked"), (found.unsurveyed, "marked, not surveyed")):
-        if some:
-            err.print(f"[yellow]warning:[/] {text}:", ", ".join(some), markup=True)
+    strays = {"surveyed, but not marked": found.unmarked, "marked, not surveyed": found.unsurveyed}
+    warn(*(f"{text}: {', '.join(some)}" for text, some in strays.items() if some))
 
 
 def _add_features(read: RigReading, path: Path) -> None:
     """A table of points that several cameras see."""
-    from kcal.locate.survey import read_features
-
-    read.add("features", read_features(path, read.given.marks_sigma, read.names))
+    read.add("features", kcal.rig.read_features(path, read.given.marks_sigma, read.names))
 
 
 def _add_pairs(read: RigReading, files: Sequence[Path]) -> None:
     """Boards that two cameras saw, or any of more."""
-    from kcal.calibrate.rig.pairs import boards_of_several, pair_by_name, paired_boards, read_pairs
-    from kcal.corners.observations import Observations
+    from kcal.calibrate.rig.pairs import boards_of_several, read_pairs
 
     if len(read.cameras) != 2:
-        own = {c: Observations.load(path) for c, path in zip(cameras_of_files(files, read.names), files, strict=True)}
+        own = {
+            c: kcal.Observations.load(path) for c, path in zip(cameras_of_files(files, read.names), files, strict=True)
+        }
         read.add("boards", boards_of_several(list(read.cameras.values()), read.names, own))
         return
     if len(files) != 2:
         raise InputError("--pairs: two files are needed, of the left and of the right camera")
     match = read.given.match
     first, second = read.cameras.values()
-    seen = Observations.load(files[0]), Observations.load(files[1])
+    seen = kcal.Observations.load(files[0]), kcal.Observations.load(files[1])
     check_views_of((first, second), seen, files)
     views = seen[0].names, seen[1].names
-    matched = pair_by_name(*views) if match is None else read_pairs(match, *views)
-    read.add("boards", paired_boards((first, second), seen, matched))
+    matched = kcal.rig.pair_by_name(*views) if match is None else read_pairs(match, *views)
+    read.add("boards", kcal.rig.paired_boards((first, second), seen, matched))
     read.unpaired = len(views[0]) + len(views[1]) - 2 * len(matched)
 
 
@@ -558,7 +538,7 @@ READERS: dict[str, Callable[[RigReading, Any], None]] = {
 }
 
 
-def read_sources(cameras: Sequence[Camera], sources: Sources, names: Sequence[str] = CAMERAS) -> RigReading:
+def read_sources(cameras: Sequence[kcal.Camera], sources: Sources, names: Sequence[str] = CAMERAS) -> RigReading:
     """Read everything; warnings about it are printed. Two cameras are left and right, one or more have their names."""
     if (sources.landmarks is None) != (sources.marks is None):
         raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
@@ -575,21 +555,10 @@ def read_sources(cameras: Sequence[Camera], sources: Sources, names: Sequence[st
     return read
 
 
-def load_cameras(paths: Sequence[Path]) -> tuple[Camera, ...]:
+def load_cameras(paths: Sequence[Path]) -> tuple[kcal.Camera, ...]:
     """Cameras from files; a file given at several places is one `Camera`, whose lens is the same at all of them."""
-    from kcal.io.camera_file import load_camera
-
-    found = {path: load_camera(path) for path in dict.fromkeys(paths)}
+    found = {path: kcal.load_camera(path) for path in dict.fromkeys(paths)}
     return tuple(found[path] for path in paths)
-
-
-def place_names(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Names of camera files up to their first dots; NAME-1, NAME-2 ... for a file given at several places."""
-    names = []
-    for number, path in enumerate(paths):
-        name, turn = path.name.split(".")[0], paths[: number + 1].count(path)
-        names.append(f"{name}-{turn}" if paths.count(path) > 1 else name)
-    return tuple(names)
 
 
 def cameras_of_files(paths: Sequence[Path], names: Sequence[str]) -> list[int]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar
 
 import pydantic
 
+import kcal
 from kcal.cli.console import out, print_table
 from kcal.cli.inputs import SHOWN
 from kcal.cli.stations import print_stands
@@ -25,8 +26,6 @@ from kcal.texts import number_text, setting_text
 
 if TYPE_CHECKING:
     from kcal.io.file_summary import CameraSummary, RigSummary
-    from kcal.lens.camera import Camera
-    from kcal.lens.rig import Rig
 
 # The block of a file, as it is stored, and what is derived of it.
 _Camera: TypeAlias = "tuple[dict[str, Any], CameraSummary]"
@@ -67,12 +66,12 @@ def show_command(file: Annotated[Path, SHOWN]) -> None:
 
 
 def _show_foreign(file: Path) -> None:
-    from kcal.io.formats import import_cameras, recognized
+    from kcal.io.formats import recognized
 
     if recognized(file) == "kcal":
         kind = file_kind(file)
         raise FileError(f"{file}: kcal show knows camera, rig and observations files, not {kind} files")
-    found = import_cameras(file)
+    found = kcal.lens.import_cameras(file)
     out.print(f"{file}: {found.format}, {len(found.cameras)} cameras", markup=False)
     for note in found.notes:
         out.print(f"  {note}", markup=False)
@@ -109,15 +108,12 @@ def _as_written(content: dict[str, Any]) -> tuple[list[_Camera], _Rig | None] | 
 
 def _computed_anew(file: Path, kind: str) -> tuple[list[_Camera], _Rig | None]:
     if kind == "camera":
-        from kcal.io.camera_file import load_camera
+        return [_derived_camera(kcal.load_camera(file))], None
 
-        return [_derived_camera(load_camera(file))], None
-    from kcal.io.rig_file import load_rig
-
-    return _derived_rig(load_rig(file))
+    return _derived_rig(kcal.load_rig(file))
 
 
-def _derived_camera(camera: Camera) -> _Camera:
+def _derived_camera(camera: kcal.Camera) -> _Camera:
     from kcal.io.camera_file import camera_to_file
     from kcal.io.file_summary import CameraSummary
 
@@ -125,7 +121,7 @@ def _derived_camera(camera: Camera) -> _Camera:
     return content, CameraSummary.derived(camera, content)
 
 
-def _derived_rig(rig: Rig) -> tuple[list[_Camera], _Rig]:
+def _derived_rig(rig: kcal.Rig) -> tuple[list[_Camera], _Rig]:
     from kcal.io.file_summary import RigSummary, take_joint_errors
     from kcal.io.rig_file import rig_to_file
 
@@ -200,9 +196,8 @@ def _show_pose(content: Mapping[str, Any], known: RigSummary) -> None:
 
 
 def _show_stations(file: Path) -> None:
-    from kcal.io.rig_file import load_rig
 
-    rig = load_rig(file)
+    rig = kcal.load_rig(file)
     for camera in rig.each:
         _show_camera(*_derived_camera(camera))
     out.print("")
@@ -217,9 +212,8 @@ def _show_stations(file: Path) -> None:
 
 
 def _show_observations(file: Path) -> None:
-    from kcal.corners.observations import Observations
 
-    seen = Observations.load(file)
+    seen = kcal.Observations.load(file)
     counts = [sum(pixel is not None for pixel in view.pixels) for view in seen.views]
     width, height = seen.image_size
     out.print(f"board {seen.board}; images {width}x{height} px; refinement {seen.refinement}", markup=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Annotated
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_of
@@ -64,19 +65,20 @@ def sites_command(
         output: CSV file to write: the map, one line for each point.
         picture: The map.
     """
-    from kcal.io.rig_file import load_rig
-    from kcal.locate.ground import level_ground
-    from kcal.locate.raster import terrain as raster_of
-    from kcal.locate.siting import area_of, rank_sites, read_sites, sites_of, siting_map
+    from kcal.locate.siting import read_sites, sites_of, siting_map
     from kcal.locate.stations import stations_of
 
     for path in filter(None, (output, picture)):
         check_writable(path, *filter(None, (towers, candidates, terrain)))
     if (terrain is None) == (ground is None):
         raise InputError("give --terrain, or --ground with the height of level ground above the ellipsoid; one of them")
-    surface = level_ground(ground) if terrain is None and ground is not None else raster_of(terrain or "", geoid)
+    surface = (
+        kcal.locate.level_ground(ground)
+        if terrain is None and ground is not None
+        else kcal.locate.terrain(terrain or "", geoid)
+    )
     if file_kind(towers) == "rig":
-        rig = stations_of(load_rig(towers))
+        rig = stations_of(kcal.load_rig(towers))
         standing = sites_of(rig, pixel_sigma_of(pixel_sigma, rig))
         if rig.root is None:
             warn(f"{towers}: the rig has no error bars: bearings count as exact but for the noise of marks")
@@ -87,9 +89,9 @@ def sites_command(
     if twice := {name for name in names if names.count(name) > 1}:
         raise InputError(f"{candidates}: {min(twice)!r} is a tower and a candidate; names must differ")
     with steps("looking from each site", None):
-        field = area_of(list(area), surface, (*standing, *proposed), cells=cells, above=above)
+        field = kcal.locate.area_of(list(area), surface, (*standing, *proposed), cells=cells, above=above)
         now = siting_map(field, standing)
-        ranked = rank_sites(field, standing, proposed, build=build)
+        ranked = kcal.locate.rank_sites(field, standing, proposed, build=build)
         later = siting_map(field, [*standing, *(one.site for one in ranked if one.order)]) if ranked else None
     if unknown := 1.0 - float(field.known.double().mean()):
         warn(f"the terrain has no heights in {100 * unknown:.1f} % of the area, which is left out")
@@ -109,10 +111,9 @@ def sites_command(
     if output is not None:
         write_atomic(output, _map_text(field, now, later))
     if picture is not None:
-        from kcal.report.figures import save_picture
         from kcal.report.positions import siting_figure
 
-        save_picture(picture, siting_figure(field, standing, ranked))
+        kcal.report.save_picture(picture, siting_figure(field, standing, ranked))
     print_wrote(output, picture)
 
 
@@ -216,14 +217,16 @@ def budget_command(
     import math
 
     from kcal.io.rig_file import load_pair
-    from kcal.locate.budget import BudgetErrors, planned_rig, range_errors, range_sigmas, usual_ranges
+    from kcal.locate.budget import range_sigmas, usual_ranges
     from kcal.report.tables import range_sigma_rows
 
-    chosen = planned_rig(focal_px=focal, baseline_m=baseline.value) if rig is None else load_pair(rig)
+    chosen = kcal.rig.planned_rig(focal_px=focal, baseline_m=baseline.value) if rig is None else load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, None if rig is None else chosen)
     disparity = math.sqrt(2.0) * noise
     error = 0.001 if baseline.sigma is None else baseline.sigma
-    errors = BudgetErrors(disparity_px=disparity, yaw_deg=yaw_sigma, baseline_m=error, timing_s=timing, speed_mps=speed)
+    errors = kcal.locate.BudgetErrors(
+        disparity_px=disparity, yaw_deg=yaw_sigma, baseline_m=error, timing_s=timing, speed_mps=speed
+    )
     far = list(distances or usual_ranges(chosen, _BASELINES))
     labels = {
         "disparity": f"disparity {disparity:.3g} px",
@@ -231,7 +234,7 @@ def budget_command(
         "baseline": f"baseline {range_text(error)}",
         "timing": f"{1000 * timing:g} ms apart at {speed:g} m/s",
     }
-    found = range_errors(chosen, far, errors)
+    found = kcal.locate.range_errors(chosen, far, errors)
     if rig is None:
         out.print(f"planned rig: f {focal:g} px, baseline {baseline.value:g} m, f B {focal * baseline.value:g} px m")
     else:
@@ -248,9 +251,8 @@ def budget_command(
     if aperture is not None:
         print_star_budget(chosen, aperture, pitch, clock_sigma)
     if picture is not None:
-        from kcal.report.figures import save_picture
         from kcal.report.positions import budget_figure, plotted_ranges
 
         sweep = plotted_ranges(far)
-        save_picture(picture, budget_figure(sweep, range_errors(chosen, sweep, errors), labels))
+        kcal.report.save_picture(picture, budget_figure(sweep, kcal.locate.range_errors(chosen, sweep, errors), labels))
     print_wrote(picture)

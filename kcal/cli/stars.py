@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import single_camera
@@ -16,11 +17,9 @@ from kcal.files import check_writable
 
 if TYPE_CHECKING:
     from kcal.calibrate.camera.result import CameraCalibrationResult
-    from kcal.lens.rig import Origin, Rig
     from kcal.stars.detect import DetectedStars
     from kcal.stars.lens import StarCamera
-    from kcal.stars.night import NamedStars, SkyView
-    from kcal.stars.sky import StarCatalog
+    from kcal.stars.night import NamedStars
 
 
 # Night images as commands read them: when and where they were taken, and the lens that their stars tell.
@@ -45,25 +44,22 @@ class Night:
     temperature: kinds.Celsius | None = None
     pressure: kinds.Hectopascal | None = None
 
-    def view(self, path: Path) -> SkyView:
+    def view(self, path: Path) -> kcal.stars.SkyView:
         """Of one image."""
         from kcal.stars.detect import time_of
-        from kcal.stars.night import SkyView
-        from kcal.stars.sky import Air
 
         known = {} if self.temperature is None else {"celsius": self.temperature, "celsius_sigma": 1.0}
         known |= {} if self.pressure is None else {"hectopascal": self.pressure, "hectopascal_sigma": 1.0}
-        air = None if self.site is None else Air.at_height(self.site.height, **known)
+        air = None if self.site is None else kcal.stars.Air.at_height(self.site.height, **known)
         time = time_of(self.time, path)
-        return SkyView(time=time, origin=self.site, air=air, dut1=self.dut1, time_sigma=self.time_sigma)
+        return kcal.stars.SkyView(time=time, origin=self.site, air=air, dut1=self.dut1, time_sigma=self.time_sigma)
 
 
 def camera_by_stars(
-    files: list[Path], views: list[SkyView], what: str, boards: CameraCalibrationResult | None = None
+    files: list[Path], views: list[kcal.stars.SkyView], what: str, boards: CameraCalibrationResult | None = None
 ) -> tuple[StarCamera, tuple[int, int]]:
     """The camera of night images, and of what boards said of it before; and the images' size."""
-    from kcal.stars.detect import detect_stars, read_night
-    from kcal.stars.lens import calibrate_by_stars
+    from kcal.stars.detect import read_night
 
     stars: list[DetectedStars] = []
     sizes = set()
@@ -71,7 +67,7 @@ def camera_by_stars(
         for path in files:
             try:
                 image = read_night(path)
-                stars.append(detect_stars(image))
+                stars.append(kcal.stars.detect_stars(image))
             except KcalError as error:
                 raise InputError(f"{path.name}: {error}") from error
             sizes.add((image.shape[1], image.shape[0]))
@@ -80,7 +76,7 @@ def camera_by_stars(
         raise InputError(f"the images have several sizes ({sorted(sizes)}): one camera has one")
     (size,) = sizes
     with steps(what, None) as advance:
-        return calibrate_by_stars(stars, views, size, boards=boards, progress=advance), size
+        return kcal.stars.calibrate_by_stars(stars, views, size, boards=boards, progress=advance), size
 
 
 # What stars would give a planned rig, for `kcal budget --stars`.
@@ -92,7 +88,7 @@ _EXPOSURES, _PAIRS = (1 / 30, 0.25, 1.0, 4.0, 8.0), 20
 _SKIES = {"rural": 20.5, "suburb": 18.0}
 
 
-def print_star_budget(rig: Rig, aperture: float, altitude: float, clock: float) -> None:
+def print_star_budget(rig: kcal.Rig, aperture: float, altitude: float, clock: float) -> None:
     """Print how many stars a lens, an exposure and a sky give, and what range error follows from them.
 
     Args:
@@ -141,7 +137,7 @@ _PARTS = 3
 _FEW_IN_A_PART = 3
 
 
-def by_night(images: list[str] | None, time: str | None, site: Origin | None, output: Path, name: str) -> None:
+def by_night(images: list[str] | None, time: str | None, site: kcal.Origin | None, output: Path, name: str) -> None:
     """Calibrate a camera from the stars of night images alone, and write it.
 
     Args:
@@ -151,21 +147,19 @@ def by_night(images: list[str] | None, time: str | None, site: Origin | None, ou
         output: camera file.
         name: of the camera.
     """
-    from kcal.io.camera_file import save_camera
-
     if not images:
         raise InputError("give observations of a board (from `kcal detect`), or night images with --stars")
     found = _by_stars(images, time, site, output)
     camera = found.lens.camera
     if camera.calibration is not None and name:
         camera.calibration = dataclasses.replace(camera.calibration, name=name)
-    save_camera(camera, output)
+    kcal.save_camera(camera, output)
     out.print("at infinity, without an entrance pupil: for what is farther than some hundred pupil movements")
     print_wrote(output)
 
 
 def joined_by_stars(
-    boards: CameraCalibrationResult, images: list[str], time: str | None, site: Origin | None, output: Path
+    boards: CameraCalibrationResult, images: list[str], time: str | None, site: kcal.Origin | None, output: Path
 ) -> CameraCalibrationResult:
     """The calibration by boards, refined by stars. Other arguments as of `by_night`."""
     found = _by_stars(images, time, site, output, boards)
@@ -183,7 +177,7 @@ def joined_by_stars(
 def _by_stars(
     images: list[str],
     time: str | None,
-    site: Origin | None,
+    site: kcal.Origin | None,
     output: Path,
     boards: CameraCalibrationResult | None = None,
 ) -> StarCamera:
@@ -209,10 +203,8 @@ def _by_stars(
         f"along an axis; f {float(found.lens.camera.params[0]):.2f} px; the stars determine {found.lens.effective:.1f} "
         "unknowns of the lens"
     )
-    for number, why in found.refused.items():
-        warn(f"{files[number].name}: {why}")
-    for text in sparse_parts(found, size):
-        warn(text)
+    warn(*(f"{files[number].name}: {why}" for number, why in found.refused.items()))
+    warn(*sparse_parts(found, size))
     if site is None:
         warn(
             "without --time and --site refraction stays in the lens: it shrinks heights by 0.03 % overhead, 0.12 % at "
@@ -268,14 +260,13 @@ def stars_command(
         picture: the first image that has names, with them.
     """
     from kcal.stars.detect import expand_nights, read_night
-    from kcal.stars.night import clock_doubts, name_stars
-    from kcal.stars.sky import StarCatalog
+    from kcal.stars.night import clock_doubts
 
     files = expand_nights(images)
     if picture is not None:
         check_writable(picture, *files)
     views = [night.view(path) for path in files]
-    catalog = StarCatalog.bundled()
+    catalog = kcal.stars.StarCatalog.bundled()
     lens = single_camera(camera) if camera else camera_by_stars(files, views, "finding the lens")[0].lens.camera
     told: list[dict[str, Any]] = []
     seen: list[tuple[str, NamedStars]] = []
@@ -284,7 +275,7 @@ def stars_command(
         for path, view in zip(files, views, strict=True):
             try:
                 image = read_night(path)
-                found = name_stars(image, lens, view, catalog)
+                found = kcal.stars.name_stars(image, lens, view, catalog)
             except KcalError as error:
                 if len(files) == 1:
                     raise
@@ -296,8 +287,7 @@ def stars_command(
                 told.append(_told(path, found))
                 seen.append((path.name, found))
                 rows.append(_row(path, found))
-                for text in found.warnings:
-                    warn(f"{path.name}: {text}")
+                warn(*(f"{path.name}: {text}" for text in found.warnings))
             advance(path.name)
     for number, text in clock_doubts([found for _, found in seen]):
         warn(f"{seen[number][0]}: {text}")
@@ -311,7 +301,7 @@ def stars_command(
     print_wrote(picture)
 
 
-def _heads(view: SkyView) -> list[str]:
+def _heads(view: kcal.stars.SkyView) -> list[str]:
     if view.on_earth:
         return ["heading", "pitch", "roll", "± east", "± north", "± up", "left out"]
     return ["right ascension", "declination", "± x", "± y", "± z", "left out"]
@@ -345,10 +335,9 @@ def _told(path: Path, found: NamedStars) -> dict[str, Any]:
     }
 
 
-def _draw(picture: Path, image: Any, found: NamedStars, catalog: StarCatalog, title: str) -> None:
-    from kcal.report.figures import save_picture
+def _draw(picture: Path, image: Any, found: NamedStars, catalog: kcal.stars.StarCatalog, title: str) -> None:
     from kcal.report.rig import stars_figure
 
     star = found.attitude.star.tolist()
     names = [catalog.name_of(int(catalog.number[i])) if i >= 0 else "" for i in star]
-    save_picture(picture, stars_figure(image, found.detected.pixels, names, found.attitude.residual, title))
+    kcal.report.save_picture(picture, stars_figure(image, found.detected.pixels, names, found.attitude.residual, title))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import kcal
 import kcal.cli.rig_sources as rig_sources
 from kcal.cli import console, kinds
 from kcal.cli.console import aligned, err, out, print_table, print_wrote, steps, tell, warn
@@ -24,9 +25,6 @@ from kcal.texts import length_text, measured_length, measured_text, number_text
 
 if TYPE_CHECKING:
     from kcal.calibrate.rig.result import RigResult
-    from kcal.calibrate.rig.solve import RigOptions
-    from kcal.lens.rig import Rig
-    from kcal.report.verdict import Requirement
 
 
 # What `kcal rig` prints of a solved rig.
@@ -48,7 +46,7 @@ def source_lines(result: RigResult) -> list[str]:
     return aligned(rows)
 
 
-def rig_lines(result: RigResult, rig: Rig, unpaired: int) -> list[str]:
+def rig_lines(result: RigResult, rig: kcal.Rig, unpaired: int) -> list[str]:
     """What a result says: residuals by source, the relative pose with its sigmas, the board's squares, the mounting."""
     from kcal.report.judge_rig import triangulated_sides
 
@@ -89,7 +87,7 @@ def rig_lines(result: RigResult, rig: Rig, unpaired: int) -> list[str]:
     return lines
 
 
-def _exact_line(result: RigResult, rig: Rig) -> str:
+def _exact_line(result: RigResult, rig: kcal.Rig) -> str:
     """Which cameras were taken as exact, what an error of their lenses does, and which files had no error bars."""
     far, share = 100.0 * float(rig.baseline), 10.0 / float(rig.left.focal.mean())
     text = (
@@ -117,44 +115,33 @@ def print_rig(result: RigResult, lines: list[str]) -> None:
             err.print("[yellow]left out:[/]", f"{item.label}: {item.reason}")
         if len(gone) > _MOST_NAMED:
             err.print("[yellow]left out:[/]", f"{len(gone) - _MOST_NAMED} more {source}")
-    for text in result.warnings:
-        err.print("[yellow]warning:[/]", text)
+    warn(*result.warnings)
 
 
 # How rigs of any number of cameras are solved, for `kcal rig` and `kcal station`.
 
 
-def camera_names(paths: Sequence[Path]) -> tuple[str, ...]:
+def camera_names(paths: Sequence[Path], *, told_apart: bool = True) -> tuple[str, ...]:
     """Names of camera files up to their first dots; NAME-1, NAME-2 ... for one file at several places.
 
     Raises:
-        InputError: two files of one name.
+        InputError: two files of one name, where marks are `told_apart` by it.
     """
-    names = rig_sources.place_names(paths)
-    for path, name in zip(paths, names, strict=True):
-        if names.count(name) > 1:
+    names = []
+    for number, path in enumerate(paths):
+        name, turn = path.name.split(".")[0], paths[: number + 1].count(path)
+        names.append(f"{name}-{turn}" if paths.count(path) > 1 else name)
+        if told_apart and names.count(names[-1]) > 1:
             raise InputError(f"{path}: two cameras are named {name!r}; rename a file: marks are told apart by them")
-    return names
-
-
-def _check_sources(sources: Sources) -> None:
-    """Refuse what only rigs of two cameras are solved from."""
-    for given, option, instead in (
-        (sources.match, "--match", "views belong together by their names"),
-        (sources.scene, "--scene", "give matches as a table by --features"),
-    ):
-        if given is not None:
-            raise InputError(f"{option} is for rigs of two cameras; {instead}")
+    return tuple(names)
 
 
 def _cure_of_sources(paths: Sequence[Path], sources: Sources, error: object) -> str:
     """The command after a refusal of what a rig of two cameras was to be solved from."""
-    from kcal.corners.observations import Observations
-
     if len(paths) != 2:
         return ""
     if sources.pairs and sources.landmarks is None and isinstance(error, InputError):
-        return console.look_at_views(Observations.load(sources.pairs[0]), sources.pairs[0])
+        return console.look_at_views(kcal.Observations.load(sources.pairs[0]), sources.pairs[0])
     survey = sources.landmarks or "survey.csv"
     return console.mark_again("--cameras", *paths, "--landmarks", survey, marks=sources.marks)
 
@@ -162,10 +149,10 @@ def _cure_of_sources(paths: Sequence[Path], sources: Sources, error: object) -> 
 def solve_and_write(
     paths: Sequence[Path],
     sources: Sources,
-    options: RigOptions,
+    options: kcal.RigOptions,
     output: Path,
     *,
-    needs: tuple[Requirement, ...] = (),
+    needs: tuple[kcal.report.Requirement, ...] = (),
     report: Path | None = None,
     picture: Path | None = None,
 ) -> None:
@@ -173,14 +160,14 @@ def solve_and_write(
 
     The rig is written; it is printed how each camera stands, and whether the rig may be used.
     """
-    from kcal.io.rig_file import save_rig
     from kcal.locate.mirrored import solve_surveyed
-    from kcal.locate.mounting import placed_rig
 
     two = len(paths) == 2
-    names = rig_sources.place_names(paths) if two else camera_names(paths)
-    if not two:
-        _check_sources(sources)
+    names = camera_names(paths, told_apart=not two)
+    if not two and sources.match:
+        raise InputError("--match is for rigs of two cameras; views belong together by their names")
+    if not two and sources.scene:
+        raise InputError("--scene is for rigs of two cameras; give matches as a table by --features")
     for path in filter(None, (output, report)):
         check_writable(path, *paths, *sources.files)
     cameras = rig_sources.load_cameras(paths)
@@ -193,22 +180,18 @@ def solve_and_write(
     if not two:
         rig = result.stations(read.origin)
     else:
-        rig = result.stereo() if read.origin is None else placed_rig(result, read.origin)
+        rig = result.stereo() if read.origin is None else kcal.rig.placed_rig(result, read.origin)
     known = read.pixel_sigma if two and sources.pixel_sigma is None else sources.marks_sigma
     if rig.calibration is not None and known is not None:
         rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=known)
     noise, note = pixel_sigma_and_source(sources.pixel_sigma, rig)
     # Everything that can fail comes before the file.
     lines = rig_lines(result, rig, read.unpaired) if two else source_lines(result)
-    left_out = {item.label: item.reason for item in result.left_out}
-    tell(rms_px=result.rms, warnings=list(result.warnings), left_out=left_out)
+    tell(rms_px=result.rms, left_out={item.label: item.reason for item in result.left_out})
     print_rig(result, [*lines, *read.told(result)])
-    save_rig(rig, output)
+    kcal.save_rig(rig, output)
     if picture is not None:
-        from kcal.report.figures import save_picture
-        from kcal.report.rig import rig_figure
-
-        save_picture(picture, rig_figure(result))
+        kcal.report.save_picture(picture, kcal.report.rig_figure(result))
     if two:
         baseline = float(rig.baseline)
         tell(baseline_m=baseline, baseline_sigma_m=result.sigma_baseline, pairs=list(result.pairs))
@@ -217,19 +200,19 @@ def solve_and_write(
         tell(undetermined=list(result.undetermined))
         print_stands(rig)
         if rig.root is None:
-            err.print("[yellow]warning:[/] the data leave something open, so that the rig has no error bars")
+            warn("the data leave something open, so that the rig has no error bars")
         if rig.origin is None:
             out.print(
                 "No latitudes were given: positions are meters of the local frame. --site anchors it on the Earth."
             )
     print_wrote(output, picture)
     if needs or report is not None:
-        from kcal.report.judge_rig import named_cameras, rig_verdict
+        from kcal.report.judge_rig import named_cameras
         from kcal.report.verdict_pictures import rig_pictures
 
         pairs = sources.pairs or ()
         sides = judged_sides(named_cameras(rig), pairs if two and _calibrated_from(rig, pairs) else (), noise)
-        verdict = rig_verdict(
+        verdict = kcal.report.rig_verdict(
             rig, needs, mark_sigma=noise, result=result, cameras=[found[0] for found in sides],
             subject=output.name.split(".")[0],
         )  # fmt: skip
@@ -242,7 +225,7 @@ def solve_and_write(
             raise typer.Exit(NO)
 
 
-def _print_ranges(rig: Rig, noise: float, note: str) -> None:
+def _print_ranges(rig: kcal.Rig, noise: float, note: str) -> None:
     """Print what the errors of ranges consist of."""
     from kcal.locate.budget import range_sigmas
     from kcal.report.tables import range_sigma_rows
@@ -255,18 +238,16 @@ def _print_ranges(rig: Rig, noise: float, note: str) -> None:
         warn(f"range errors are not split: {error}")
 
 
-def _calibrated_from(rig: Rig, pairs: Sequence[Path]) -> bool:
+def _calibrated_from(rig: kcal.Rig, pairs: Sequence[Path]) -> bool:
     """Whether these are the views from which both cameras were calibrated, as far as their names tell."""
-    from kcal.corners.observations import Observations
-
     records = [camera.calibration.record if camera.calibration else None for camera in (rig.left, rig.right)]
     return bool(pairs) and all(
-        record is not None and set(record.per_view_rms) <= set(Observations.load(file).names)
+        record is not None and set(record.per_view_rms) <= set(kcal.Observations.load(file).names)
         for record, file in zip(records, pairs, strict=True)
     )
 
 
-def print_stands(rig: Rig) -> None:
+def print_stands(rig: kcal.Rig) -> None:
     """Print how each camera stands, with error bars: on the Earth, or in the rig's own frame."""
     import torch
 
@@ -333,8 +314,6 @@ def station_command(
         camera: Camera file.
         output: Rig file to write, with one camera.
     """
-    from kcal.calibrate.rig.solve import RigOptions
-
     if sources.landmarks is None and sources.terrain is None:
         raise typer.BadParameter("give surveyed places and --marks, or a raster of the terrain (--terrain)")
-    solve_and_write([camera], sources, RigOptions(), output)
+    solve_and_write([camera], sources, kcal.RigOptions(), output)

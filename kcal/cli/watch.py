@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.console import err, on_signals, out, print_wrote, steps, warn
 from kcal.cli.options import Kind
@@ -20,9 +21,8 @@ from kcal.texts import measured_text
 
 if TYPE_CHECKING:
     from kcal.corners.images import Gray
-    from kcal.lens.rig import Rig
     from kcal.pipeline.video_source import FramesTogether
-    from kcal.watch.watcher import Noticed, Watched, Watcher, Webhook
+    from kcal.watch.watcher import Noticed, Watcher, Webhook
 
 _EXIT = "exit"
 # Points of a picture.
@@ -78,7 +78,7 @@ def watch_command(
     from kcal.corners.images import read_gray
     from kcal.io.rig_file import load_pair
     from kcal.watch.history import Temperatures
-    from kcal.watch.watcher import Watched, Watcher, Webhook
+    from kcal.watch.watcher import Watcher, Webhook
     from kcal.watch.watcher import relock as relocked_by
 
     if images and len(images) != 2:
@@ -110,7 +110,7 @@ def watch_command(
         if not watcher.last_time > -math.inf:
             raise InputError("no pair of images was looked at")
     with steps("fitting how it turns", None):
-        watched = Watched.read(output, known)
+        watched = kcal.rig.Watched.read(output, known)
     _tell_turns(watched, limit)
     if picture is not None:
         _draw_turns(watched, picture, limit, output.name)
@@ -123,7 +123,7 @@ def watch_command(
         raise typer.Exit(DRIFTED)
 
 
-def _follow(watcher: Watcher, rig: Rig, sources: tuple[str, str], hooks: list[Webhook], *, ends: bool) -> None:
+def _follow(watcher: Watcher, rig: kcal.Rig, sources: tuple[str, str], hooks: list[Webhook], *, ends: bool) -> None:
     """Look until the sources end, it is stopped, or an alarm ends it."""
     frames, stopped = None, False
     if not Path(sources[0]).is_dir():
@@ -168,11 +168,10 @@ def _of_frames(watcher: Watcher, frames: FramesTogether) -> Iterator[tuple[float
 
 
 def _folder_pairs(watcher: Watcher, folders: tuple[str, str]) -> Iterator[tuple[float, Gray, Gray]]:
-    from kcal.calibrate.rig.pairs import pair_by_name
     from kcal.corners.images import expand_images, image_time, read_gray
 
     files = [{path.name: path for path in expand_images([folder])} for folder in folders]
-    pairs = pair_by_name(*(list(own) for own in files))
+    pairs = kcal.rig.pair_by_name(*(list(own) for own in files))
     if not pairs:
         raise InputError(f"no image of {folders[0]} belongs to one of {folders[1]}; name pairs alike")
     timed = sorted((image_time(files[0][left]), left, right) for left, right in pairs)
@@ -210,7 +209,7 @@ def _summary(watcher: Watcher, hooks: list[Webhook]) -> str:
     return "; ".join(parts)
 
 
-def _tell_turns(watched: Watched, limit: float) -> None:
+def _tell_turns(watched: kcal.rig.Watched, limit: float) -> None:
     """The attitude now, and how the rig turns."""
     drift = watched.drift_at(watched.times[-1])
     model, degrees = watched.model, math.degrees(1.0)
@@ -226,10 +225,9 @@ def _tell_turns(watched: Watched, limit: float) -> None:
     )
 
 
-def _draw_turns(watched: Watched, picture: Path, limit: float, title: str) -> None:
+def _draw_turns(watched: kcal.rig.Watched, picture: Path, limit: float, title: str) -> None:
     import numpy as np
 
-    from kcal.report.figures import save_picture
     from kcal.report.rig import attitude_figure
 
     step = -(-len(watched.times) // _DRAWN)
@@ -242,4 +240,4 @@ def _draw_turns(watched: Watched, picture: Path, limit: float, title: str) -> No
     angle = np.degrees(np.stack([drift.relative.numpy() for drift in drifts]))
     sigma = np.degrees(np.stack([drift.relative_covariance.diagonal().sqrt().numpy() for drift in drifts]))
     seen = np.array(watched.seen[::step], bool)
-    print_wrote(save_picture(picture, attitude_figure(np.array(times), angle, sigma, seen, limit, title)))
+    print_wrote(kcal.report.save_picture(picture, attitude_figure(np.array(times), angle, sigma, seen, limit, title)))

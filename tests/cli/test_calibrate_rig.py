@@ -138,8 +138,8 @@ class TestCalibrate:
         [
             ("--fix cz", "unknown parameter 'cz'"),
             ("--fix k4", "opencv5 has no parameter 'k4'"),
-            ("--fix cx=a", "'a' is not a number"),
-            ("--fix cx --fix cx=3", "fixed twice"),
+            ("--fix cx=a", "--fix cx 'a': write NAME or NAME=NUMBER"),
+            ("--fix cx --fix cx=3", "cx is stated twice"),
             ("--prior cx=3", "NAME=VALUE±SIGMA"),
             ("--prior cx=3±0", "positive standard deviation"),
             ("--fix cx --prior cx=3±1", "fixed and given a prior"),

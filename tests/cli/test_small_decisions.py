@@ -15,7 +15,8 @@ from typer.testing import CliRunner, Result
 from kcal.cli.demo_practice import _first, _short_meters, _signed
 from kcal.cli.main import app
 from kcal.cli.rig_options import Sources
-from kcal.cli.rig_sources import READERS, RigReading, parse_baselines, place_names, read_sources
+from kcal.cli.rig_sources import READERS, RigReading, parse_baselines, read_sources
+from kcal.cli.stations import camera_names
 from kcal.errors import InputError
 from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
@@ -128,10 +129,14 @@ class TestSources:
     def test_names_of_places(self) -> None:
         """A file given several times is one camera at several places."""
         paths = [Path(f"{name}.camera.json") for name in ("mill", "mast", "mill")]
-        assert place_names(paths) == ("mill-1", "mast", "mill-2")
+        assert camera_names(paths) == ("mill-1", "mast", "mill-2")
+        alike = [Path("a/cam.json"), Path("b/cam.json")]
+        assert camera_names(alike, told_apart=False) == ("cam", "cam")
+        with pytest.raises(InputError, match="two cameras are named 'cam'"):
+            camera_names(alike)
         mill = CAMERAS[0].with_parameters(CAMERAS[0].params)
         mill.calibration = CameraCalibration(name="mill")
-        told = read_sources((mill, CAMERAS[1], mill), Sources(), place_names(paths)).one_camera
+        told = read_sources((mill, CAMERAS[1], mill), Sources(), camera_names(paths)).one_camera
         assert told == ["mill-1 and mill-2 are one camera that stood at 2 places: its lens is the same unknown"]
 
     def test_baselines(self) -> None:
