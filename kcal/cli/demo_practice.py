@@ -7,7 +7,6 @@ import functools
 import importlib
 import importlib.resources
 import json
-import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import kcal.sim.practice as practice
-from kcal.cli.console import err, out, print_table, steps, warn
+from kcal.cli.console import err, out, steps, tell_table, warn
 from kcal.errors import FileError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
 from kcal.io.camera_file import load_camera
@@ -25,11 +24,12 @@ from kcal.io.rig_file import load_pair
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.report.positions import save_site_sketch
-from kcal.report.practice_score import score_lens, score_positions, score_rig, score_tracks
+from kcal.report.practice_score import score_cameras, score_positions, score_rig, score_tracks
 from kcal.sim.scene import DemoScene, render_board, scene_views
 from kcal.stars.night import SkyView
 from kcal.stars.sky import StarCatalog
 from kcal.strict_json import MOST_BYTES, read_json
+from kcal.table import Table
 
 # The texts of a practice site: what is where, the surveyor's list, and what is to be located.
 
@@ -272,10 +272,16 @@ def practice_score(folder: Path) -> None:
         FileError: no site is there, or a result that cannot be read.
     """
     truth = read_truth_file(folder)
-    _score_cameras(folder, truth)
-    if _score_rig(folder, truth):
-        _score_positions(_first(folder, POSITIONS), truth)
-        _score_tracks(_first(folder, TRACKS), truth)
+    paths = {side: folder / f"{side}.camera.json" for side in practice.SIDES}
+    cameras = {side: load_camera(path) for side, path in paths.items() if path.exists()}
+    _show("cameras", "Cameras: error over the image after the best-fit rotation", score_cameras(cameras, truth))
+    rig = load_pair(folder / "rig.json") if (folder / "rig.json").exists() else None
+    what = "Rig: error of ranges over the image, with marks that have no noise"
+    _show("ranges", what, None if rig is None else score_rig(rig, truth))
+    if rig is not None:
+        true, own = truth["baseline_m"], float(rig.baseline)
+        out.print(f"baseline {own:.4f} m, {1e3 * (own - true):+.1f} mm off")
+        _score_located(_first(folder, POSITIONS), _first(folder, TRACKS), truth)
     step = next_step(folder)
     if step is None:
         out.print("All steps are done.")
@@ -298,81 +304,29 @@ def next_step(folder: Path) -> Exercise | None:
     return None
 
 
-def _show(what: str, heads: list[str], rows: list[list[str]]) -> None:
+def _show(name: str, what: str, table: Table | None) -> None:
     out.print(f"\n[bold]{what}[/]")
-    if rows:
-        print_table([heads, *rows])
-    else:
+    if table is None or not table.rows:
         out.print("not done yet")
+    else:
+        tell_table(name, table)
 
 
-def _score_cameras(folder: Path, truth: dict[str, Any]) -> None:
-    rows = []
-    for side in ("left", "right"):
-        path = folder / f"{side}.camera.json"
-        if path.exists():
-            found = score_lens(load_camera(path), truth["cameras"][side], truth["baseline_m"])
-            pixels = [f"{value:.3f}" for value in (found.rms, found.middle, found.largest)]
-            rows.append([side, *pixels, f"{found.sideways_m:.2f} m", f"{found.range_m:.0f} m"])
-    heads = ["camera", "RMS px", "middle px", "largest px", "sideways at 5 km", "range at 5 km"]
-    _show("Cameras: error over the image after the best-fit rotation", heads, rows)
-
-
-def _score_rig(folder: Path, truth: dict[str, Any]) -> bool:
-    """Whether there is a rig."""
-    path = folder / "rig.json"
-    rig = load_pair(path) if path.exists() else None
-    rows = []
-    for found in [] if rig is None else score_rig(rig, truth):
-        stated = "none" if found.stated is None else _short_meters(found.stated)
-        rows.append([f"{found.range_m / 1000:g} km", _signed(found.mean), _short_meters(found.rms), stated])
-    heads = ["at", "mean m", "RMS m", "one sigma as stated m"]
-    _show("Rig: error of ranges over the image, with marks that have no noise", heads, rows)
-    if rig is not None:
-        true, own = truth["baseline_m"], float(rig.baseline)
-        out.print(f"baseline {own:.4f} m, {1e3 * (own - true):+.1f} mm off")
-    return rig is not None
-
-
-def _score_positions(path: Path | None, truth: dict[str, Any]) -> None:
-    scores = [] if path is None else score_positions(path, truth)
-    rows = [
-        [found.name, f"{found.range_m:.0f}", _short_meters(found.level), _signed(found.range_off),
-         "yes" if found.contains else "no"]
-        for found in scores
-    ]  # fmt: skip
-    heads = ["target", "range m", "off on the map m", "off in range m", "95 % interval contains it"]
-    _show("Positions: against the truth", heads, rows)
-    if scores:
-        inside = sum(found.contains for found in scores)
-        out.print(f"{inside} of {len(scores)} intervals contain the true range; 95 % are to be expected")
-    missing = [name for name in truth["targets"] if name.casefold() not in {each.name.casefold() for each in scores}]
-    if path is not None and missing:
-        out.print(f"not among the positions: {', '.join(missing)} (names as in targets.csv)", markup=False)
-
-
-def _score_tracks(path: Path | None, truth: dict[str, Any]) -> None:
-    scores, strays = ([], 0) if path is None else score_tracks(path, truth)
-    rows = []
-    for found in scores:
-        share = "" if math.isnan(found.contained) else f"{100 * found.contained:.0f} %"
-        counts = [f"{found.range_m:.0f}", f"{100 * found.followed:.0f} %", f"{found.tracks}"]
-        rows.append([found.name, *counts, _short_meters(found.level), _short_meters(found.range_off), share])
-    heads = ["ship", "range m", "followed", "tracks", "off on the map m", "off in range m", "intervals with the truth"]
-    _show("Tracks: against the ships", heads, rows)
+def _score_located(positions: Path | None, tracks: Path | None, truth: dict[str, Any]) -> None:
+    scores = None if positions is None else score_positions(positions, truth)
+    _show("positions", "Positions: against the truth", scores)
+    if scores is not None:
+        known = {str(row["target"]).casefold(): row["contains"] for row in scores.records}
+        if known:
+            inside = sum(row["contains"] for row in scores.records)
+            out.print(f"{inside} of {len(scores.rows)} intervals contain the true range; 95 % are to be expected")
+        if missing := [name for name in truth["targets"] if name.casefold() not in known]:
+            out.print(f"not among the positions: {', '.join(missing)} (names as in targets.csv)", markup=False)
+    found, strays = (None, 0) if tracks is None else score_tracks(tracks, truth)
+    _show("tracks", "Tracks: against the ships", found)
     if strays:
         warn(f"{strays} tracks are near no ship")
 
 
 def _first(folder: Path, names: tuple[str, ...]) -> Path | None:
     return next((folder / name for name in names if (folder / name).exists()), None)
-
-
-def _short_meters(value: float) -> str:
-    if math.isnan(value):
-        return ""
-    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}" if abs(value) >= 0.01 else f"{value:.3f}"
-
-
-def _signed(value: float) -> str:
-    return f"{'-' if value < 0 else '+'}{_short_meters(abs(value))}"

@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from kcal.lens.turning import rotation_between
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.localizer import Localizer
+from kcal.table import Table
 
 Floats = NDArray[np.float64]
 _FAR = 5000.0  # meters, at which errors of lenses are told
@@ -31,83 +32,52 @@ _EXACT = 1e-3  # px: noise of marks that are exact
 _STRAY = 0.2  # share of a ship's distance: a track that is farther off belongs to no ship
 
 
-class LensScore(NamedTuple):
-    """How far a camera is off after the turn that fits best, over the whole image.
+def score_cameras(cameras: Mapping[str, Camera], truth: dict[str, Any]) -> Table:
+    """How far each camera is off after the turn that fits best, over the whole image and in its middle half.
 
-    Attributes:
-        rms: px.
-        largest: px.
-        middle: px, RMS over the middle half of the image's width and height.
-        sideways_m: what the RMS is at 5 km, across the line of sight.
-        range_m: and in range, for a second camera at the site's baseline.
-    """
-
-    rms: float
-    largest: float
-    middle: float
-    sideways_m: float
-    range_m: float
-
-
-def score_lens(camera: Camera, truth: dict[str, Any], baseline: float) -> LensScore:
-    """Compare a camera with the true one.
+    What the RMS is at 5 km is told across the line of sight, and in range for two such cameras at the site's baseline.
 
     Args:
-        camera: calibrated.
-        truth: of one camera, see `kcal.sim.practice`.
-        baseline: meters.
+        cameras: calibrated, by their sides.
+        truth: of the site, see `kcal.sim.practice`.
 
     Raises:
         InputError: images of another size.
     """
+    columns = {
+        "camera": "camera", "rms_px": "RMS px", "middle_px": "middle px", "largest_px": "largest px",
+        "sideways_m": "sideways at 5 km", "range_m": "range at 5 km",
+    }  # fmt: skip
+    rows = []
+    for side, camera in cameras.items():
+        off, central, focal = _pixels_off(camera, truth["cameras"][side])
+        found = off.isfinite()
+        rms, middle = (float(off[some].square().mean().sqrt()) for some in (found, found & central))
+        sideways, along = rms / focal * _FAR, rms * _FAR**2 / (focal * truth["baseline_m"])
+        pixels = [(value, f"{value:.3f}") for value in (rms, middle, float(off[found].max()))]
+        rows.append([side, *pixels, (sideways, f"{sideways:.2f} m"), (along, f"{along:.0f} m")])
+    return Table(columns, rows)
+
+
+@torch.no_grad()
+def _pixels_off(camera: Camera, truth: dict[str, Any]) -> tuple[Tensor, Tensor, float]:
+    """Errors at the truth's pixels (NaN: outside), which of these are in the middle half, and the focal length, px."""
     if list(camera.size) != truth["size"]:
         raise InputError(
             f"this camera has images of {camera.size[0]}x{camera.size[1]} px, those of the site have "
             f"{truth['size'][0]}x{truth['size'][1]}"
         )
     pixels, true = (torch.tensor(truth[name], dtype=torch.float64) for name in ("pixels", "rays"))
-    with torch.no_grad():
-        rays, valid = camera.unproject(pixels)
-        turn = rotation_between(true[valid], rays[valid])
-        focal = float(camera.focal.detach().mean())
-        seen, there = camera.project(1e9 * (true @ turn.T))
-    off = torch.linalg.vector_norm(seen - pixels, dim=-1)
-    off = torch.where(valid & there, off, torch.nan)
+    rays, valid = camera.unproject(pixels)
+    seen, there = camera.project(1e9 * (true @ rotation_between(true[valid], rays[valid]).T))
+    off = torch.where(valid & there, torch.linalg.vector_norm(seen - pixels, dim=-1), torch.nan)
     size = torch.tensor(camera.size, dtype=torch.float64)
-    central = ((pixels - 0.5 * (size - 1)).abs() < 0.25 * size).all(-1)
-
-    def rms(values: Tensor) -> float:
-        return float(values[values.isfinite()].square().mean().sqrt())
-
-    whole = rms(off)
-    return LensScore(
-        rms=whole,
-        largest=float(off[off.isfinite()].max()),
-        middle=rms(off[central]),
-        sideways_m=whole / focal * _FAR,
-        range_m=whole * _FAR**2 / (focal * baseline),
-    )
-
-
-class RangeScore(NamedTuple):
-    """How far ranges are off at a true range, with marks that have no noise.
-
-    Attributes:
-        range_m: the true one.
-        mean: error over the image, meters.
-        rms: of the error.
-        stated: one sigma as the rig states it in the middle of the image; None if it states none.
-    """
-
-    range_m: float
-    mean: float
-    rms: float
-    stated: float | None
+    return off, ((pixels - 0.5 * (size - 1)).abs() < 0.25 * size).all(-1), float(camera.focal.mean())
 
 
 @torch.no_grad()
-def score_rig(rig: Rig, truth: dict[str, Any]) -> list[RangeScore]:
-    """Compare ranges of exact marks with the true ones, over the image."""
+def score_rig(rig: Rig, truth: dict[str, Any]) -> Table:
+    """Ranges of marks without noise against the true ones, over the image, beside one sigma that the rig states."""
     placed = rig.mounting is not None
     localize = Localizer(
         rig,
@@ -115,120 +85,92 @@ def score_rig(rig: Rig, truth: dict[str, Any]) -> list[RangeScore]:
         origin=None if placed else Origin(lat=0.0, lon=0.0, height=0.0),
         heading_deg=None if placed else 0.0,
     )
-    found = []
+    columns = {"range_m": "at", "mean_m": "mean m", "rms_m": "RMS m", "stated_m": "one sigma as stated m"}
+    rows: list[list[Any]] = []
     for pairs in truth["pairs"]:
         left, right = (torch.tensor(pairs[side], dtype=torch.float64) for side in ("left", "right"))
-        ranges = torch.linalg.vector_norm(localize(left, right).enu, dim=-1)
-        off = (ranges - pairs["range_m"]).numpy()
-        off = off[np.isfinite(off)]
-        stated = None
+        off = torch.linalg.vector_norm(localize(left, right).enu, dim=-1) - pairs["range_m"]
+        off = off[off.isfinite()]
+        stated: tuple[float | None, str] = (None, "none")
         if rig.covariance is not None:
-            stated = float(range_sigmas(rig, [pairs["range_m"]], pixel_sigma=_EXACT).total[0])
-        mean, rms = (float(off.mean()), math.sqrt(float(np.square(off).mean()))) if len(off) else (math.nan, math.nan)
-        found.append(RangeScore(pairs["range_m"], mean, rms, stated))
-    return found
+            stated = _meters(float(range_sigmas(rig, [pairs["range_m"]], pixel_sigma=_EXACT).total[0]))
+        mean, rms = float(off.mean()), float(off.square().mean().sqrt())
+        rows.append([(pairs["range_m"], f"{pairs['range_m'] / 1000:g} km"), _signed(mean), _meters(rms), stated])
+    return Table(columns, rows)
 
 
-class PositionScore(NamedTuple):
-    """How far a position is off.
-
-    Attributes:
-        name: of the target.
-        range_m: the true one.
-        level: meters from the truth, on the map.
-        range_off: range minus the true one, meters.
-        contains: whether the 95 % interval contains the true range.
-    """
-
-    name: str
-    range_m: float
-    level: float
-    range_off: float
-    contains: bool
-
-
-def score_positions(path: Path, truth: dict[str, Any]) -> list[PositionScore]:
-    """Compare positions with the true ones, by name."""
+def score_positions(path: Path, truth: dict[str, Any]) -> Table:
+    """Positions of a file against the true ones of the same names: on the map, in range, and by their intervals."""
     true = {name.casefold(): np.array(place) for name, place in truth["targets"].items()}
-    found = []
+    columns = {
+        "target": "target", "range_m": "range m", "level_m": "off on the map m", "range_off_m": "off in range m",
+        "contains": "95 % interval contains it",
+    }  # fmt: skip
+    rows: list[list[Any]] = []
     for row in located_rows(path, truth):
-        place = true.get(row.name.strip().casefold())
-        if place is not None:
-            found.append(_position_score(row, place))
-    return sorted(found, key=lambda score: score.range_m)
+        if (place := true.get(row.name.strip().casefold())) is not None:
+            far, level, off, inside = row.against(place)
+            answer = inside, "yes" if inside else "no"
+            rows.append([row.name, (far, f"{far:.0f}"), _meters(level), _signed(off), answer])
+    return Table(columns, sorted(rows, key=lambda row: float(row[1][0])))
 
 
-class TrackScore(NamedTuple):
-    """How well a ship was followed.
+def score_tracks(path: Path, truth: dict[str, Any]) -> tuple[Table, int]:
+    """Tracks against the ships that they are nearest to, by their medians; and how many tracks are near none.
 
-    Attributes:
-        name: of the ship.
-        range_m: true one, on average.
-        followed: share of the moments at which there was a position.
-        tracks: how many tracks it had.
-        level: median distance from the truth on the map, meters.
-        range_off: median size of the range's error.
-        contained: share of 95 % intervals that contain the true range.
+    A ship is followed at the share of the moments at which it has a position.
     """
-
-    name: str
-    range_m: float
-    followed: float
-    tracks: int
-    level: float
-    range_off: float
-    contained: float
-
-
-def score_tracks(path: Path, truth: dict[str, Any]) -> tuple[list[TrackScore], int]:
-    """Compare tracks with the ships that they are nearest to; and how many tracks are near none."""
     times = np.array(truth["ships"]["times"])
     ships = {name: np.array(places) for name, places in truth["ships"]["places"].items()}
-    tracks: dict[str, list[tuple[float, PositionRow]]] = defaultdict(list)
+    tracks: dict[str, list[PositionRow]] = defaultdict(list)
     for row in located_rows(path, truth):
         if row.time is not None:
-            tracks[row.name].append((row.time, row))
-    scores: dict[str, list[tuple[int, PositionScore]]] = {ship: [] for ship in ships}
+            tracks[row.name].append(row)
+    # Of each ship: track, moment, distance, and errors on the map and in range of each row.
+    own: dict[str, list[tuple[Any, ...]]] = {ship: [] for ship in ships}
     strays = 0
-    for rows in tracks.values():
+    for name, rows in tracks.items():
         each = {
-            ship: [(round(1e3 * time), _position_score(row, _place_at(places, times, time))) for time, row in rows]
+            ship: [(name, round(1e3 * (row.time or 0.0)), *row.against(_place_at(places, times, row.time or 0.0)))
+                   for row in rows]
             for ship, places in ships.items()
-        }
-        nearest = min(each, key=lambda ship: float(np.median([score.level for _, score in each[ship]])))
-        if np.median([score.level / score.range_m for _, score in each[nearest]]) > _STRAY:
+        }  # fmt: skip
+        nearest = min(each, key=lambda ship: float(np.median([level for _, _, _, level, *_ in each[ship]])))
+        if np.median([level / far for _, _, far, level, *_ in each[nearest]]) > _STRAY:
             strays += 1
         else:
-            scores[nearest] += each[nearest]
-    found = []
-    for ship, own in scores.items():
-        found.append(
-            TrackScore(
-                name=ship,
-                range_m=float(np.linalg.norm(ships[ship], axis=-1).mean()),
-                followed=len({moment for moment, _ in own}) / len(times),
-                tracks=len({score.name for _, score in own}),
-                level=_median([score.level for _, score in own]),
-                range_off=_median([abs(score.range_off) for _, score in own]),
-                contained=float(np.mean([score.contains for _, score in own])) if own else math.nan,
-            )
-        )
-    return sorted(found, key=lambda score: score.range_m), strays
-
-
-def _median(values: list[float]) -> float:
-    return float(np.median(values)) if values else math.nan
+            own[nearest] += each[nearest]
+    columns = {
+        "ship": "ship", "range_m": "range m", "followed": "followed", "tracks": "tracks", "level_m": "off on the map m",
+        "range_off_m": "off in range m", "contained": "intervals with the truth",
+    }  # fmt: skip
+    found: list[list[Any]] = []
+    for ship, some in own.items():
+        far = float(np.linalg.norm(ships[ship], axis=-1).mean())
+        names, moments, _, levels, offs, inside = zip(*some, strict=True) if some else [()] * 6
+        level, off = ((float(np.median(np.abs(each))) if each else math.nan) for each in (levels, offs))
+        share, contained = len(set(moments)) / len(times), float(np.mean(inside)) if inside else math.nan
+        count = len(set(names))
+        found.append([
+            ship, (far, f"{far:.0f}"), (share, f"{100 * share:.0f} %"), (count, f"{count}"), _meters(level),
+            _meters(off), (contained, "" if math.isnan(contained) else f"{100 * contained:.0f} %"),
+        ])  # fmt: skip
+    return Table(columns, sorted(found, key=lambda row: float(row[1][0]))), strays
 
 
 def _place_at(places: Floats, times: Floats, time: float) -> Floats:
     return np.array([np.interp(time, times, column) for column in places.T])
 
 
-def _position_score(row: PositionRow, true: Floats) -> PositionScore:
-    away = float(np.linalg.norm(true))
-    east, north = row.enu[:2] - true[:2]
-    contains = row.range_low_m <= away <= row.range_high_m
-    return PositionScore(row.name, away, math.hypot(east, north), row.range_m - away, contains)
+def _meters(value: float) -> tuple[float, str]:
+    """A cell."""
+    if math.isnan(value):
+        return value, ""
+    return value, f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}" if abs(value) >= 0.01 else f"{value:.3f}"
+
+
+def _signed(value: float) -> tuple[float, str]:
+    return value, f"{'-' if value < 0 else '+'}{_meters(abs(value))[1]}"
 
 
 class PositionRow(NamedTuple):
@@ -240,6 +182,12 @@ class PositionRow(NamedTuple):
     range_low_m: float
     range_high_m: float
     time: float | None
+
+    def against(self, true: Floats) -> tuple[float, float, float, bool]:
+        """The true range, errors on the map and in range, and whether the interval contains the true range."""
+        away = float(np.linalg.norm(true))
+        level = math.hypot(*(self.enu[:2] - true[:2]))
+        return away, level, self.range_m - away, self.range_low_m <= away <= self.range_high_m
 
 
 def located_rows(path: Path, truth: dict[str, Any]) -> list[PositionRow]:

@@ -179,14 +179,14 @@ def table(truth: dict[str, Any], rows: list[tuple[str, list[float], float | None
 def test_positions_are_compared_with_the_truth(tmp_path: Path, truth: dict[str, Any], shift: float) -> None:
     rows = [(name.upper(), place, None) for name, place in truth["targets"].items()]
     (tmp_path / "p.csv").write_text(table(truth, rows, shift).replace(",time_s", "").replace(",\n", "\n"))
-    scores = score_positions(tmp_path / "p.csv", truth)
-    assert [score.name for score in scores] == [name.upper() for name in truth["targets"]]
-    np.testing.assert_allclose([score.level for score in scores], shift, atol=1e-6)
+    scores = score_positions(tmp_path / "p.csv", truth).records
+    assert [score["target"] for score in scores] == [name.upper() for name in truth["targets"]]
+    np.testing.assert_allclose([score["level_m"] for score in scores], shift, atol=1e-6)
     for score in scores:
-        place = np.array(truth["targets"][score.name.lower()])
+        place = np.array(truth["targets"][score["target"].lower()])
         expected = np.linalg.norm(place + np.array([0.0, shift, 0.0])) - np.linalg.norm(place)
-        assert score.range_off == pytest.approx(expected, abs=1e-6)
-        assert score.contains == (abs(expected) <= 10)
+        assert score["range_off_m"] == pytest.approx(expected, abs=1e-6)
+        assert score["contains"] == (abs(expected) <= 10)
 
 
 def test_tracks_are_compared_with_the_nearest_ship(tmp_path: Path, truth: dict[str, Any]) -> None:
@@ -196,11 +196,11 @@ def test_tracks_are_compared_with_the_nearest_ship(tmp_path: Path, truth: dict[s
     rows += [("track 3", [100.0, 9000.0, 0.0], time) for time in times]
     (tmp_path / "t.csv").write_text(table(truth, rows, 2.0))
     scores, strays = score_tracks(tmp_path / "t.csv", truth)
-    found = {score.name: score for score in scores}
+    found = {score["ship"]: score for score in scores.records}
     assert strays == 1
-    assert (found["trawler"].followed, found["coaster"].followed, found["patrol boat"].followed) == (0.5, 1.0, 0.0)
-    assert found["trawler"].level == pytest.approx(2.0, abs=1e-6)
-    assert (found["coaster"].tracks, found["coaster"].contained) == (1, 1.0)
+    assert [found[ship]["followed"] for ship in ("trawler", "coaster", "patrol boat")] == [0.5, 1.0, 0.0]
+    assert found["trawler"]["level_m"] == pytest.approx(2.0, abs=1e-6)
+    assert (found["coaster"]["tracks"], found["coaster"]["contained"]) == (1, 1.0)
 
 
 def test_options_that_exclude_each_other(tmp_path: Path) -> None:
@@ -227,10 +227,10 @@ def test_the_walk_of_a_stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     done = CliRunner().invoke(app, ["demo", "--score", "."], catch_exceptions=False)
     assert "All steps are done." in done.output
     truth = json.loads(TRUTH.read_text())
-    scores = score_positions(Path("positions.geojson"), truth)
+    scores = score_positions(Path("positions.geojson"), truth).records
     assert len(scores) == 7
     # Of seven intervals of 95 %, five or more contain the truth in 99.6 % of cases.
-    assert sum(score.contains for score in scores) >= 5
-    assert abs(scores[0].range_off) < 5.0
+    assert sum(score["contains"] for score in scores) >= 5
+    assert abs(scores[0]["range_off_m"]) < 5.0
     ships, _ = score_tracks(Path("tracks.csv"), truth)
-    assert max(ship.followed for ship in ships) > 0.5
+    assert max(ship["followed"] for ship in ships.records) > 0.5

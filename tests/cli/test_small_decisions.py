@@ -12,7 +12,7 @@ import pytest
 import torch
 from typer.testing import CliRunner, Result
 
-from kcal.cli.demo_practice import _first, _short_meters, _signed
+from kcal.cli.demo_practice import _first
 from kcal.cli.main import app
 from kcal.cli.rig_options import Sources
 from kcal.cli.rig_sources import READERS, RigReading, parse_baselines, read_sources
@@ -24,6 +24,7 @@ from kcal.io.rig_file import save_rig
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Rig
+from kcal.report.practice_score import _meters, _signed
 
 CAMERAS = [
     Camera.build(focal=(1600 + 5 * k, 1600), center=(960, 540), size=(1920, 1080), model="pinhole") for k in range(2)
@@ -35,12 +36,12 @@ CAMERAS = [
     (0.0004, "0.000"), (-0.25, "-0.25"), (math.nan, ""),
 ])  # fmt: skip
 def test_meters(value: float, text: str) -> None:
-    assert _short_meters(value) == text
+    assert _meters(value)[1] == text
 
 
 @pytest.mark.parametrize(("value", "text"), [(12.4, "+12"), (-12.4, "-12"), (-0.5, "-0.5"), (0.0, "+0.000")])
 def test_errors_have_their_sign(value: float, text: str) -> None:
-    assert _signed(value) == text
+    assert _signed(value) == (value, text)
 
 
 def test_the_first_result_that_is_there(tmp_path: Path) -> None:

@@ -146,13 +146,14 @@ class TestScores:
         rows = [("gate ", (3.0, 496.0, 9.0), 495.0, 480.0, 499.0), ("MAST", (300.0, 1.0, 0.0), 310.0, 280.0, None),
                 ("else", (0.0, 0.0, 0.0), 1.0, 0.0, 2.0)]  # fmt: skip
         path = self.file(tmp_path / "a.geojson", rows)
-        mast, gate = score_positions(path, truth)
-        assert (mast.name, mast.range_m, mast.contains) == ("MAST", 300.0, True)
-        assert mast.level == pytest.approx(1.0, abs=1e-3)
-        assert mast.range_off == pytest.approx(10.0)
-        assert (gate.range_m, gate.contains) == (500.0, False)
-        assert gate.level == pytest.approx(5.0, abs=1e-3)
-        assert gate.range_off == pytest.approx(-5.0)
+        table = score_positions(path, truth)
+        close = {"level_m": pytest.approx(1.0, abs=1e-3), "range_off_m": pytest.approx(10.0)}
+        mast, gate = table.records
+        assert mast == {"target": "MAST", "range_m": 300.0, "contains": True, **close}
+        assert (gate["range_m"], gate["contains"]) == (500.0, False)
+        assert gate["level_m"] == pytest.approx(5.0, abs=1e-3)
+        assert gate["range_off_m"] == pytest.approx(-5.0)
+        assert table.cells[1:] == [["MAST", "300", "1", "+10", "yes"], ["gate ", "500", "5", "-5", "no"]]
         assert len(located_rows(path, truth)) == 3
         lines = tmp_path / "a.geojsonl"
         lines.write_text("\n".join(json.dumps(one) for one in json.loads(path.read_text())["features"]))
@@ -183,15 +184,16 @@ class TestScores:
             at.append(time)
         rows.append(("d", (900.0, 900.0, 0.0), 1272.0, 1200.0, 1300.0))
         at.append(1.0)
-        (near, far), strays = score_tracks(self.file(tmp_path / "t.geojson", rows, at), truth)
+        table, strays = score_tracks(self.file(tmp_path / "t.geojson", rows, at), truth)
+        near, far = table.records
         assert strays == 1
-        assert (near.name, near.tracks, near.followed, near.contained) == ("near", 2, 0.75, 1.0)
-        assert near.level == pytest.approx(1.0, abs=1e-3)
-        assert near.range_m == pytest.approx(np.mean([math.hypot(10 * k, 400) for k in range(4)]))
-        assert (far.name, far.tracks, far.followed) == ("far", 1, 0.75)
-        assert far.contained == pytest.approx(2 / 3)
-        assert far.level == pytest.approx(2.0, abs=1e-3)
-        assert far.range_off == pytest.approx(4.0)
+        assert [near[key] for key in ("ship", "tracks", "followed", "contained")] == ["near", 2, 0.75, 1.0]
+        assert near["level_m"] == pytest.approx(1.0, abs=1e-3)
+        assert near["range_m"] == pytest.approx(np.mean([math.hypot(10 * k, 400) for k in range(4)]))
+        assert [far[key] for key in ("ship", "tracks", "followed")] == ["far", 1, 0.75]
+        assert far["contained"] == pytest.approx(2 / 3)
+        assert far["level_m"] == pytest.approx(2.0, abs=1e-3)
+        assert far["range_off_m"] == pytest.approx(4.0)
         place = _place_at(np.array([[0.0, 1.0], [10.0, 5.0]]), np.array([1.0, 3.0]), 1.5)
         assert place.tolist() == [2.5, 2.0]
 

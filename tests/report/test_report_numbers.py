@@ -16,7 +16,7 @@ from kcal.lens.difference import camera_difference, difference_text
 from kcal.report.calibration import difference_figure
 from kcal.report.pages import _correlations, _percent, _sentence, range_rows
 from kcal.report.positions import plotted_ranges
-from kcal.report.practice_score import score_lens, score_rig
+from kcal.report.practice_score import score_cameras, score_rig
 from kcal.report.tables import chance_text
 from kcal.report.verdict import RangeAnswer, Requirement, Verdict
 
@@ -31,42 +31,46 @@ def rig(yaw: float = 0.0) -> Rig:
 class TestScores:
     def truth(self) -> dict[str, Any]:
         pixels = CAMERA.grid(33, 25).reshape(-1, 2)
-        return {"size": [640, 480], "pixels": pixels.tolist(), "rays": CAMERA.unproject(pixels)[0].tolist()}
+        rays = CAMERA.unproject(pixels)[0].tolist()
+        return {"baseline_m": 10.0, "cameras": {"left": {"size": [640, 480], "pixels": pixels.tolist(), "rays": rays}}}
 
     def test_a_turned_camera_is_the_same(self) -> None:
         truth = self.truth()
         turn = rotation_from_vector(torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64))
-        truth["rays"] = (torch.tensor(truth["rays"], dtype=torch.float64) @ turn.T).tolist()
-        assert score_lens(CAMERA, truth, 10.0).largest < 1e-8
+        own = truth["cameras"]["left"]
+        own["rays"] = (torch.tensor(own["rays"], dtype=torch.float64) @ turn.T).tolist()
+        assert score_cameras({"left": CAMERA}, truth).records[0]["largest_px"] < 1e-8
 
     def test_a_longer_focal_length(self) -> None:
         """One percent: pixels off by that share of their distance from the center, after no turn at all."""
         longer = Camera.build(focal=(808, 808), center=(319.5, 239.5), size=(640, 480), model="pinhole")
-        found = score_lens(longer, self.truth(), 10.0)
+        truth = self.truth()
+        (found,) = score_cameras({"left": longer}, truth).records
         pixels = CAMERA.grid(33, 25).reshape(-1, 2) - torch.tensor([319.5, 239.5])
         off = 0.01 * pixels.norm(dim=-1)
         inner = (pixels.abs() < torch.tensor([160.0, 120.0])).all(-1)
-        assert found.rms == pytest.approx(float(off.square().mean().sqrt()), rel=1e-6)
-        assert found.largest == pytest.approx(float(off.max()), rel=1e-6)
-        assert found.middle == pytest.approx(float(off[inner].square().mean().sqrt()), rel=1e-6)
+        assert found["rms_px"] == pytest.approx(float(off.square().mean().sqrt()), rel=1e-6)
+        assert found["largest_px"] == pytest.approx(float(off.max()), rel=1e-6)
+        assert found["middle_px"] == pytest.approx(float(off[inner].square().mean().sqrt()), rel=1e-6)
         # At 5 km; and by a second camera 10 m beside.
-        assert found.sideways_m == pytest.approx(found.rms * 5000.0 / 808.0)
-        assert found.range_m == pytest.approx(found.rms * 5000.0**2 / (808.0 * 10.0))
+        assert found["sideways_m"] == pytest.approx(found["rms_px"] * 5000.0 / 808.0)
+        assert found["range_m"] == pytest.approx(found["rms_px"] * 5000.0**2 / (808.0 * 10.0))
+        truth["cameras"]["left"]["size"] = [320, 240]
         with pytest.raises(InputError, match="images of 640x480 px, those of the site have 320x240"):
-            score_lens(longer, self.truth() | {"size": [320, 240]}, 10.0)
+            score_cameras({"left": longer}, truth)
 
     def test_ranges_of_a_rig_with_a_wrong_yaw(self) -> None:
         """At 1 km a yaw of 1e-5 rad is 1 m, of 10 m of baseline; farther or nearer by its sign."""
         points = torch.tensor([[x, 0.0, math.sqrt(1e6 - x * x)] for x in (-100.0, 0.0, 100.0)], dtype=torch.float64)
         left, right = rig()(points)[0].unbind(-2)
         truth = {"pairs": [{"range_m": 1000.0, "left": left.tolist(), "right": right.tolist()}]}
-        (exact,) = score_rig(rig(), truth)
-        assert exact.mean == pytest.approx(0.0, abs=1e-5)
-        assert exact.rms == pytest.approx(0.0, abs=1e-5)
-        assert exact.stated is None
-        (off,) = score_rig(rig(1e-5), truth)
-        assert abs(off.mean) == pytest.approx(1.0, rel=0.03)
-        assert off.rms == pytest.approx(abs(off.mean), rel=0.01)
+        (exact,) = score_rig(rig(), truth).records
+        assert exact["mean_m"] == pytest.approx(0.0, abs=1e-5)
+        assert exact["rms_m"] == pytest.approx(0.0, abs=1e-5)
+        assert exact["stated_m"] is None
+        (off,) = score_rig(rig(1e-5), truth).records
+        assert abs(off["mean_m"]) == pytest.approx(1.0, rel=0.03)
+        assert off["rms_m"] == pytest.approx(abs(off["mean_m"]), rel=0.01)
 
 
 class TestSentences:
