@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import io
 import math
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,17 +19,12 @@ from kcal.cli.console import err, out, print_table, print_wrote, steps, tell, wa
 from kcal.cli.inputs import cameras_and_rig, named_source, single_camera
 from kcal.cli.options import Kind
 from kcal.errors import FileError, InputError
-from kcal.files import check_writable, dump_json, make_folder, read_bytes, write_atomic
-from kcal.strict_json import read_json
+from kcal.files import check_writable, make_folder, read_bytes, write_atomic
 
 _T = TypeVar("_T")
+_HEAD = 256  # bytes of a PNG file, in which its note stands
 
 # Images of one camera, resampled into a folder: image by image, so that a run that was interrupted continues.
-
-# In every folder of images: how they were made, and which are done.
-IMAGE_JOURNAL = "rectify.json"
-# Seconds between two writes of the journal.
-_OFTEN = 5.0
 
 
 def targets_of(paths: list[Path], folder: Path, others: list[Path]) -> list[Path]:
@@ -49,26 +43,10 @@ def targets_of(paths: list[Path], folder: Path, others: list[Path]) -> list[Path
     return targets
 
 
-def _done_before(journal: Path, view: str) -> dict[str, list[int]]:
-    """The files of which a view made images, as they were then: nothing is done that another view made."""
-    try:
-        content: Any = read_json(read_bytes(journal), str(journal)) if journal.exists() else {}
-    except FileError:
-        content = {}
-    fits = isinstance(content, dict) and content.get("view") == view and isinstance(content.get("done"), dict)
-    return content["done"] if fits else {}
-
-
 def _view_key(module: kcal.lens.Undistort) -> str:
     values = [value.tolist() for value in (module.camera.params, module.new_camera.params, module.rotation)]
     kinds = repr((type(module.new_camera).__name__, str(module.camera.model), module.camera.model.hybrid))
-    text = repr((values, kinds, module.camera.size, module.new_camera.size, module.at))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _file_state(path: Path) -> list[int]:
-    state = path.stat()
-    return [state.st_size, state.st_mtime_ns]
+    return repr((values, kinds, module.camera.size, module.new_camera.size, module.at))
 
 
 def convert_images(
@@ -76,55 +54,40 @@ def convert_images(
 ) -> tuple[int, list[str]]:
     """Resample images into files, a bad one not stopping the others.
 
+    Each file has a note of the image and of the view from which it was made: nothing is done again, or kept that was
+    made otherwise.
+
     Returns:
         how many were done before, and what was wrong with those that failed.
     """
-    journal, view = targets[0].parent / IMAGE_JOURNAL, _view_key(module)
-    done = _done_before(journal, view)
-
-    def save() -> float:
-        write_atomic(journal, dump_json({"view": view, "done": done}))
-        return time.monotonic()
-
-    # Before the first image: a run that is killed must not leave images that an older journal calls done.
-    saved = save()
-    failures: list[str] = []
-    before = 0
-    try:
-        for path, target in zip(paths, targets, strict=True):
-            if target.exists() and done.get(target.name) == _file_state(path):
+    before, failures, view = 0, list[str](), _view_key(module)
+    for path, target in zip(paths, targets, strict=True):
+        try:
+            data = read_bytes(path)
+            note = f"kcal rectify {hashlib.sha256(view.encode() + data).hexdigest()}"
+            if target.exists() and note.encode() in read_bytes(target)[:_HEAD]:
                 before += 1
             else:
-                try:
-                    _convert(path, target, module)
-                    done[target.name] = _file_state(path)
-                except (FileError, InputError) as error:
-                    failures.append(str(error))
-                    err.print(f"[yellow]failed[/] {escape(str(error))}")
-            if time.monotonic() - saved > _OFTEN:
-                saved = save()
-            advance(path.name)
-    finally:
-        # Where no image could be made, no journal is left.
-        if done:
-            save()
-        else:
-            journal.unlink(missing_ok=True)
+                _convert(data, path, target, module, note)
+        except (FileError, InputError) as error:
+            failures.append(str(error))
+            err.print(f"[yellow]failed[/] {escape(str(error))}")
+        advance(path.name)
     return before, failures
 
 
-def _convert(path: Path, target: Path, module: kcal.lens.Undistort) -> None:
+def _convert(data: bytes, path: Path, target: Path, module: kcal.lens.Undistort, note: str) -> None:
     import torch
 
     from kcal.corners.images import decode_image
     from kcal.io.images import write_png
 
-    image = torch.from_numpy(decode_image(read_bytes(path), path))
+    image = torch.from_numpy(decode_image(data, path))
     (height, width), size = image.shape[:2], module.camera.size
     if (width, height) != size:
         raise InputError(f"{path}: the image is {width}x{height} px, the camera {size[0]}x{size[1]} px")
     new, _ = module(image[None] if image.ndim == 2 else image.permute(2, 0, 1))
-    write_png(target, (new[0] if image.ndim == 2 else new.permute(1, 2, 0)).contiguous().numpy())
+    write_png(target, (new[0] if image.ndim == 2 else new.permute(1, 2, 0)).contiguous().numpy(), note=note)
 
 
 # `kcal rectify`: images as another camera takes them: without distortion, turned, in stereo, on a cylinder.
@@ -228,7 +191,7 @@ def _resampled(
     # What could not be written later is refused now.
     for place, files in [(folder, extras), *targets.items()]:
         make_folder(place)
-        for path in [*files, place / IMAGE_JOURNAL]:
+        for path in files:
             check_writable(path)
     count = sum(map(len, images.values()))
     before, failures = 0, list[str]()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import cv2
 import numpy as np
@@ -40,8 +42,13 @@ def encode_png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     return bytes(data.tobytes())
 
 
-def write_png(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> Path:
+def write_png(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16], *, note: str = "") -> Path:
     """Write an image as PNG, atomically; shapes and types as in `encode_png`.
+
+    Args:
+        path: of the file.
+        image: to write.
+        note: a comment (tEXt) at the beginning of the file, in Latin-1.
 
     Raises:
         InputError: another dtype or shape.
@@ -53,7 +60,14 @@ def write_png(path: str | Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -
         ...     write_png(Path(folder, "gray.png"), np.full((4, 6), 128, np.uint8)).name
         'gray.png'
     """
-    return write_atomic(path, encode_png(image))
+    data = encode_png(image)
+    if note:
+        # Behind the signature and the block IHDR, which have 33 bytes.
+        block = b"tEXtComment\0" + note.encode("latin-1")
+        data = b"".join(
+            [data[:33], struct.pack(">I", len(block) - 4), block, struct.pack(">I", crc32(block)), data[33:]]
+        )
+    return write_atomic(path, data)
 
 
 # Write videos: H.264 in MP4, by PyAV (the extra `video`).
