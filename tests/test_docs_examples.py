@@ -129,7 +129,7 @@ def commands() -> Iterator[Any]:
 @pytest.mark.parametrize(("words", "settings"), list(commands()))
 def test_a_command_is_accepted(words: list[str], settings: dict[str, Any]) -> None:
     command, arguments = resolve(words)
-    defaults = defaults_of(settings).get(words[0], {})
+    defaults = defaults_of(settings, get_command(app)).get(words[0], {})
     # Parses all options and values, and runs nothing.
     command.make_context(command.name, arguments, default_map=defaults.get(command.name, defaults))
 

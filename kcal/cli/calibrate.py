@@ -151,7 +151,7 @@ def calibrate_command(
     model: Annotated[str, Kind(metavar="NAME")] = "hybrid",
     require: Annotated[kinds.Needs | None, Kind(panel=_USE)] = None,
     report: Annotated[Path | None, Kind(panel=_USE)] = None,
-    baseline: Rare[Annotated[float, Kind(metavar="M", least=1e-3, panel=_USE)]] = 10.0,
+    baseline: Rare[Annotated[kinds.Baseline, Kind(panel=_USE)]] = 10.0,
     pixel_sigma: kinds.PixelSigma | None = None,
     focal: Rare[kinds.Pixels] | None = None,
     fov: Rare[kinds.Degrees] | None = None,

@@ -23,7 +23,7 @@ _PORT = 8348
 
 
 def capture_command(
-    source: str,
+    source: Annotated[str, Kind(setting=True)],
     *,
     output: kinds.Output,
     board: kinds.BoardOrAuto = "auto",

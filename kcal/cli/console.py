@@ -84,9 +84,9 @@ def _tell_more(name: str, *items: Any) -> None:
 
 
 def warn(*texts: str) -> None:
-    """Print warnings to the error stream; programs are told a list of them, be it empty."""
-    _tell_more("warnings", *map(visible, texts))
+    """Print warnings to the error stream."""
     for text in texts:
+        _tell_more("warnings", visible(text))
         err.print("[yellow]warning:[/]", escape(text))
 
 

@@ -31,15 +31,19 @@ Seconds = Annotated[float, Kind(metavar="S", least=0)]
 Celsius = Annotated[float, Kind(metavar="°C")]
 Hectopascal = Annotated[float, Kind(metavar="HPA")]
 Millimeters = Annotated[float, Kind(metavar="MM")]
-LeastMeters = Annotated[float, Kind(metavar="M", least=1e-3)]
+Baseline = Annotated[float, Kind(metavar="M", least=1e-3, setting=True)]
 Count = Annotated[int, Kind(metavar="N", least=1)]
 PixelSigma = Annotated[
     float,
-    Kind(metavar="PX", about="Noise of marks along each axis; that in the rig's file, or 0.3, if not given."),
+    Kind(
+        metavar="PX",
+        setting=True,
+        about="Noise of marks along each axis; that in the rig's file, or 0.3, if not given.",
+    ),
 ]
 
 # Numbers with what is known of them, VALUE±SIGMA.
-MeasuredMeters = Annotated[WithSigma, Kind(metavar="M±SIGMA", read=values.with_sigma, usage=True)]
+MeasuredBaseline = Annotated[WithSigma, Kind(metavar="M±SIGMA", read=values.with_sigma, usage=True, setting=True)]
 MeasuredDegrees = Annotated[WithSigma, Kind(metavar="DEG±SIGMA", read=values.with_sigma, usage=True)]
 MeasuredRefraction = Annotated[WithSigma, Kind(metavar="K±SIGMA", read=values.with_sigma, usage=True)]
 
@@ -149,12 +153,13 @@ _PATTERNS = (
     "inner corners, columns by rows: 9x6 has 10x7 squares; charuco:9x6[:DICTIONARY][:MARKER]; circles:7x6; "
     "asymmetric:4x11; aprilgrid:6x6[:SPACING]; or a target file of Kalibr, april.yaml."
 )
-Board = Annotated[str, Kind(metavar="BOARD", about=f"I{_PATTERNS[1:]}")]
-BoardOrAuto = Annotated[str, Kind(metavar="BOARD", about=f"auto: the images tell. Otherwise {_PATTERNS}")]
+Board = Annotated[str, Kind(metavar="BOARD", setting=True, about=f"I{_PATTERNS[1:]}")]
+BoardOrAuto = Annotated[str, Kind(metavar="BOARD", setting=True, about=f"auto: the images tell. Otherwise {_PATTERNS}")]
 Square = Annotated[
     str,
     Kind(
         metavar="LENGTH",
+        setting=True,
         about="Side of a square or tag, or distance of circles (of rows of asymmetric ones), with its unit: 25mm, "
         "2.5cm, 1in. Not with a target file.",
     ),
@@ -168,7 +173,7 @@ def _read_needs(text: str, _name: str) -> tuple[Requirement, ...]:
     return Requirement.parse(text)
 
 
-Needs = Annotated[tuple[Any, ...], Kind(metavar="RANGE:ERROR", read=_read_needs)]
+Needs = Annotated[tuple[Any, ...], Kind(metavar="RANGE:ERROR", read=_read_needs, setting=True)]
 
 
 _SETTING = "NAME=NUMBER, for example focus=3.2"

@@ -75,6 +75,9 @@ def _read_aging(text: str, name: str) -> float:
     return parse_aging(text, name)
 
 
+_SETTING = Kind(setting=True)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LocateOptions:
     """How a table is located.
@@ -103,8 +106,8 @@ class LocateOptions:
             given.
     """
 
-    site: kinds.Place | None = None
-    heading: kinds.MeasuredDegrees | None = None
+    site: Annotated[kinds.Place, _SETTING] | None = None
+    heading: Annotated[kinds.MeasuredDegrees, _SETTING] | None = None
     pitch: Rare[kinds.Degrees] = 0.0
     roll: Rare[kinds.Degrees] = 0.0
     grid: Rare[Annotated[str, Kind(metavar="CRS")] | None] = None

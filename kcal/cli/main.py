@@ -62,7 +62,7 @@ class _Commands(TyperGroup):
         name, words, *rest = *arguments, *(options.pop(key) for key in ("info_name", "args") if key in options)
         inputs.typed[:] = words
         if words[:1] != ["init"] and not {"--help", "--help-all"} & set(words):
-            options.setdefault("default_map", defaults_of(read_settings()))
+            options.setdefault("default_map", defaults_of(read_settings(), self))
         with usage_errors_shown():
             return super().make_context(name, words, *rest, **options)
 

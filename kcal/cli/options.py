@@ -41,6 +41,7 @@ class Kind:
         flags: of the option, where they are not its name.
         several: whether all words up to the next option are values of this one, as in `--stars a.png b.png`.
         rare: whether only `--help-all` shows it.
+        setting: whether kcal.toml may give it.
         panel: title of the box in the help.
         about: what it is; `{}` stands for what `Args:` say of the one option.
     """
@@ -53,6 +54,7 @@ class Kind:
     flags: tuple[str, ...] = ()
     several: bool = False
     rare: bool = False
+    setting: bool = False
     panel: str | None = None
     about: str = "{}"
 
@@ -266,6 +268,7 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     run.several = {one.name for one in options if one.kind.several}  # type: ignore[attr-defined]
+    run.settings = {one.name for one in options if one.kind.setting}  # type: ignore[attr-defined]
     return run
 
 

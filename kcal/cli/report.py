@@ -37,7 +37,7 @@ def report_command(
     *,
     observations: Several[kinds.Observed] | None = None,
     require: kinds.Needs | None = None,
-    baseline: kinds.LeastMeters = 10.0,
+    baseline: kinds.Baseline = 10.0,
     pixel_sigma: kinds.PixelSigma | None = None,
     output: kinds.Output | None = None,
 ) -> None:

@@ -23,26 +23,22 @@ taken: set[str] = set()
 
 
 class Setting(NamedTuple):
-    """One key: its type, the commands that have a parameter of that name, an example, and what reads its text."""
+    """One key: its type, an example, and what reads its text. Options of its name whose `Kind` says so take it."""
 
     kind: type
-    takers: tuple[str, ...]
     example: str
     read: Callable[[str, str], Any] | None = None
 
 
-_BOARDS = ("detect", "capture", "board print", "batch")
-_JUDGING = ("calibrate", "report", "rig solve")
-_LOCATING = ("locate", "live")
 SETTINGS = {
-    "board": Setting(str, _BOARDS, '"9x6"'),
-    "square": Setting(str, _BOARDS, '"25mm"', values.length),
-    "source": Setting(str, ("capture",), '"camera:0"'),
-    "site": Setting(str, _LOCATING, '"19.07,72.87,14"', values.place_on_earth),
-    "heading": Setting(float, _LOCATING, "35.0"),
-    "pixel_sigma": Setting(float, (*_JUDGING, "rig check", "mark", *_LOCATING, "budget"), "0.3"),
-    "require": Setting(str, _JUDGING, '"5km:10%"', values.ranges_and_errors),
-    "baseline": Setting(float, ("calibrate", "report", "budget"), "10.0"),
+    "board": Setting(str, '"9x6"'),
+    "square": Setting(str, '"25mm"', values.length),
+    "source": Setting(str, '"camera:0"'),
+    "site": Setting(str, '"19.07,72.87,14"', values.place_on_earth),
+    "heading": Setting(float, "35.0"),
+    "pixel_sigma": Setting(float, "0.3"),
+    "require": Setting(str, '"5km:10%"', values.ranges_and_errors),
+    "baseline": Setting(float, "10.0"),
 }
 
 
@@ -105,16 +101,12 @@ def checked_setting(key: str, value: Any, path: Path) -> Any:
     return wanted(value)
 
 
-def defaults_of(settings: dict[str, Any]) -> dict[str, Any]:
-    """Defaults of parameters by command, and by subcommand below that, as the command line takes them."""
-    found: dict[str, Any] = {}
-    for key, value in settings.items():
-        for command in SETTINGS[key].takers:
-            place = found
-            for word in command.split():
-                place = place.setdefault(word, {})
-            place[key] = value
-    return found
+def defaults_of(settings: dict[str, Any], command: Any) -> dict[str, Any]:
+    """Defaults of a command's parameters, and of its subcommands by their names, as the command line takes them."""
+    if not hasattr(command, "commands"):
+        return {key: settings[key] for key in getattr(command.callback, "settings", set()) & settings.keys()}
+    own = {name: defaults_of(settings, one) for name, one in command.commands.items()}
+    return {name: defaults for name, defaults in own.items() if defaults}
 
 
 def settings_text(found: dict[str, Any], path: Path) -> str:

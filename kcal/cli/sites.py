@@ -171,7 +171,7 @@ def budget_command(
     rig: kinds.RigFile | None = None,
     *,
     focal: kinds.Pixels = 1600.0,
-    baseline: kinds.MeasuredMeters = WithSigma(10.0, 0.001),
+    baseline: kinds.MeasuredBaseline = WithSigma(10.0, 0.001),
     distances: kinds.Distances | None = None,
     pixel_sigma: kinds.PixelSigma | None = None,
     yaw_sigma: kinds.DegreesSigma = 0.01,

@@ -187,7 +187,8 @@ def solve_and_write(
     noise, note = pixel_sigma_and_source(sources.pixel_sigma, rig)
     # Everything that can fail comes before the file.
     lines = rig_lines(result, rig, read.unpaired) if two else source_lines(result)
-    tell(rms_px=result.rms, left_out={item.label: item.reason for item in result.left_out})
+    left_out = {item.label: item.reason for item in result.left_out}
+    tell(rms_px=result.rms, warnings=console.told().get("warnings", []), left_out=left_out)
     print_rig(result, [*lines, *read.told(result)])
     kcal.save_rig(rig, output)
     if picture is not None:

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -268,14 +269,20 @@ def test_what_is_not_understood_is_refused(text: str, message: str, folder: Path
     assert message in str(refused.value)
 
 
-def test_every_setting_is_a_parameter_of_its_commands() -> None:
-    group = get_command(app)
-    for parameter, setting in SETTINGS.items():
-        for words in setting.takers:
-            command = group
-            for word in words.split():
-                command = command.commands[word]
-            assert parameter in [each.name for each in command.params], (words, parameter)
+def test_which_commands_take_a_setting() -> None:
+    def takers(defaults: dict[str, Any], key: str) -> set[str]:
+        nested = [one for one in defaults.items() if isinstance(one[1], dict)]
+        return {f"{name} {more}".strip() for name, own in nested for more in takers(own, key)} | (
+            {""} if not isinstance(defaults.get(key, {}), dict) else set()
+        )
+
+    found = defaults_of(EXAMPLE, get_command(app))
+    boards, judging = {"detect", "capture", "board print", "batch"}, {"calibrate", "report", "rig solve"}
+    assert {key: takers(found, key) for key in EXAMPLE} == {
+        "board": boards, "square": boards, "source": {"capture"}, "require": judging,
+        "site": {"locate", "live"}, "heading": {"locate", "live"}, "baseline": {"calibrate", "report", "budget"},
+        "pixel_sigma": {*judging, "rig check", "mark", "locate", "live", "budget", "station", "sites"},
+    }  # fmt: skip
 
 
 def test_commands_take_what_is_not_typed_and_say_so(folder: Path) -> None:
@@ -287,7 +294,6 @@ def test_commands_take_what_is_not_typed_and_say_so(folder: Path) -> None:
     assert "board.svg: 7x4 inner corners, 25 mm squares" in printed.stdout
     assert "from kcal.toml: square 25mm\n" in printed.stderr
     assert "0.354 px" in kcal("budget").stdout
-    assert defaults_of({"pixel_sigma": 0.25})["rig"]["check"] == {"pixel_sigma": 0.25}
 
 
 def test_the_file_of_a_folder_above_is_used_and_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
