@@ -272,7 +272,7 @@ def practice_score(folder: Path) -> None:
         FileError: no site is there, or a result that cannot be read.
     """
     truth = read_truth_file(folder)
-    paths = {side: folder / f"{side}.camera.json" for side in practice.SIDES}
+    paths = {str(side): folder / f"{side}.camera.json" for side in practice.SIDES}
     cameras = {side: load_camera(path) for side, path in paths.items() if path.exists()}
     _show("cameras", "Cameras: error over the image after the best-fit rotation", score_cameras(cameras, truth))
     rig = load_pair(folder / "rig.json") if (folder / "rig.json").exists() else None

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
+from rich.text import Text
 
 import kcal
 from kcal.cli import kinds
@@ -17,6 +18,7 @@ from kcal.cli.rig_sources import cameras_of_files, check_views_of
 from kcal.errors import InputError
 from kcal.file_kind import file_kind
 from kcal.files import check_writable
+from kcal.texts import visible
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -89,36 +91,17 @@ def told_usable(found: Judged, page: Path | None, warned: Iterable[Finding] = ()
     from kcal.report.pages import range_rows, save_verdict_page
 
     verdict, pictures, tables = found
-    print_verdict(verdict, warned)
+    for line in verdict.lines(warned):
+        text = Text(visible(line))
+        for words, style in ((r"^(YES|NO)\b", "bold"), ("^  met", "green"), ("^  missed", "red")):
+            text.highlight_regex(words, style)
+        out.print(text)
     if page is not None:
         ranges = [range_rows(verdict)] if verdict.answers else []
         with steps("drawing", None):
             drawn = pictures()
         print_wrote(save_verdict_page(page, verdict, drawn, [*ranges, *tables]))
     return verdict.usable
-
-
-def print_verdict(verdict: Verdict, warned: Iterable[Finding] = ()) -> None:
-    """Print findings but those that were told already, ranges, and last the answer, its reason and the next step."""
-    # What is the reason is said there.
-    told = {finding.text for finding in warned} | {one.text for one in verdict.stops if one.told == verdict.reason}
-    for cameras, findings in verdict.groups:
-        lines = [
-            f"  {one.title}: {one.sentence}" for one in findings if one.severity != "fine" and one.text not in told
-        ]
-        for line in [f"{' and '.join(cameras)}:" if cameras else "found:", *lines] if lines else ():
-            out.print(line, markup=False)
-    if verdict.answers:
-        out.print(f"ranges {verdict.basis}:", markup=False)
-    # A single answer is the reason, and said once.
-    single = [answer.text for answer in verdict.answers] == [verdict.reason]
-    for answer in () if single else verdict.answers:
-        out.print(f"  {'[green]met[/]' if answer.ok else '[red]missed[/]'}: {answer.text}")
-    word = "YES" if verdict.usable else "NO"
-    out.print(f"[bold]{word}[/]{verdict.but and f', {verdict.but}'}:", end=" ")
-    out.print(verdict.reason, markup=False)
-    if not verdict.usable:
-        out.print(f"next: {verdict.next_step}", markup=False)
 
 
 def warned_of(result: RigResult) -> list[Finding]:

@@ -48,7 +48,7 @@ def score_cameras(cameras: Mapping[str, Camera], truth: dict[str, Any]) -> Table
         "camera": "camera", "rms_px": "RMS px", "middle_px": "middle px", "largest_px": "largest px",
         "sideways_m": "sideways at 5 km", "range_m": "range at 5 km",
     }  # fmt: skip
-    rows = []
+    rows: list[list[Any]] = []
     for side, camera in cameras.items():
         off, central, focal = _pixels_off(camera, truth["cameras"][side])
         found = off.isfinite()
@@ -112,7 +112,8 @@ def score_positions(path: Path, truth: dict[str, Any]) -> Table:
             far, level, off, inside = row.against(place)
             answer = inside, "yes" if inside else "no"
             rows.append([row.name, (far, f"{far:.0f}"), _meters(level), _signed(off), answer])
-    return Table(columns, sorted(rows, key=lambda row: float(row[1][0])))
+    rows.sort(key=lambda row: float(row[1][0]))
+    return Table(columns, rows)
 
 
 def score_tracks(path: Path, truth: dict[str, Any]) -> tuple[Table, int]:
@@ -155,7 +156,8 @@ def score_tracks(path: Path, truth: dict[str, Any]) -> tuple[Table, int]:
             ship, (far, f"{far:.0f}"), (share, f"{100 * share:.0f} %"), (count, f"{count}"), _meters(level),
             _meters(off), (contained, "" if math.isnan(contained) else f"{100 * contained:.0f} %"),
         ])  # fmt: skip
-    return Table(columns, sorted(found, key=lambda row: float(row[1][0]))), strays
+    found.sort(key=lambda row: float(row[1][0]))
+    return Table(columns, found), strays
 
 
 def _place_at(places: Floats, times: Floats, time: float) -> Floats:

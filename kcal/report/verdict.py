@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from kcal.finding import FAULTS, Finding, sorted_findings
 from kcal.locate.stereo import BEARING_SIGMAS
-from kcal.texts import counted_text, range_text
+from kcal.texts import counted_text, range_text, visible
 from kcal.values import ranges_and_errors
 
 # What lessens each source, where no finding tells more.
@@ -194,6 +195,27 @@ class Verdict:
         if without_worth or worst is None:
             return next(iter([*without_worth, *self.stops]), None)
         return next((finding for finding in self.stops if finding.part == worst.most), None)
+
+    def lines(self, told: Iterable[Finding] = ()) -> list[str]:
+        """Findings but those that were `told` already, ranges, and last the answer, its reason and the next step."""
+        # What is the reason is said there.
+        known = {finding.text for finding in told} | {one.text for one in self.stops if one.told == self.reason}
+        lines = []
+        for cameras, findings in self.groups:
+            news = [f"  {one.title}: {one.sentence}" for one in findings
+                    if one.severity != "fine" and one.text not in known]  # fmt: skip
+            lines += [f"{' and '.join(cameras)}:" if cameras else "found:", *news] if news else []
+        if self.answers:
+            lines.append(f"ranges {self.basis}:")
+        # A single answer is the reason, and said once.
+        if [answer.text for answer in self.answers] != [self.reason]:
+            lines += [f"  {'met' if answer.ok else 'missed'}: {answer.text}" for answer in self.answers]
+        lines.append(f"{'YES' if self.usable else 'NO'}{self.but and f', {self.but}'}: {self.reason}")
+        return lines if self.usable else [*lines, f"next: {self.next_step}"]
+
+    def _repr_html_(self) -> str:
+        """In notebooks."""
+        return f"<pre>{html.escape(visible(chr(10).join(self.lines())))}</pre>"
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain numbers and texts, for JSON; a range that cannot be told has no sigma."""

@@ -237,7 +237,9 @@ def test_check_of_a_rig_that_turned_as_a_whole(site: Path, command: Command) -> 
 
 
 def test_check_by_landmarks(site: Path, command: Command) -> None:
-    command(SOLVE, "-o rig.json")
+    told = json.loads(command(SOLVE, "-o rig.json --json").out)
+    # Of what was read as well as of the solution.
+    assert told["warnings"][0] == "surveyed, but not marked: tree"
     arguments = "rig check rig.json --landmarks survey.csv --marks later.csv --pixel-sigma 0.1"
     printed = command(arguments, "--relock rig.json", code=3)
     line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))

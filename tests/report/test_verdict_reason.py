@@ -96,6 +96,20 @@ def test_a_yes_tells_of_doubts() -> None:
     assert Verdict(subject="left", findings=(SLIGHT, TILT)).but == ""
 
 
+def test_lines_for_the_screen_and_for_notebooks() -> None:
+    nasty = Finding(name="depth", severity="note", text="at 2 m <b>\x1b[2J", cameras=("left",))
+    needs = answer(100.0, marks=30.0, lenses=400.0), answer(500.0, marks=30.0, lenses=40.0)
+    found = Verdict(subject="rig", answers=needs, findings=(SLIGHT, TILT, nasty), basis="by simulation")
+    assert found.lines([SLIGHT]) == [
+        "found:", f"  {TILT.title}: {TILT.sentence}", "left:", f"  distances: {nasty.text}", "ranges by simulation:", f"  missed: {needs[0].text}",
+        f"  met: {needs[1].text}", f"NO: {found.reason}", f"next: {found.next_step}",
+    ]  # fmt: skip
+    assert "found:\n  lens model: it bends; measure the board\n" in found._repr_html_()
+    assert "at 2 m &lt;b&gt;\\x1b[2J" in found._repr_html_()
+    (answered,) = (fine := Verdict(subject="left", answers=needs[1:])).answers
+    assert fine.lines()[1:] == [f"YES: {answered.text}"]
+
+
 def test_what_is_not_known_is_no_yes() -> None:
     given = answer(500.0, marks=10.0, lenses=math.inf)
     assert not given.ranged
