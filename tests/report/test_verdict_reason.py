@@ -101,7 +101,8 @@ def test_lines_for_the_screen_and_for_notebooks() -> None:
     needs = answer(100.0, marks=30.0, lenses=400.0), answer(500.0, marks=30.0, lenses=40.0)
     found = Verdict(subject="rig", answers=needs, findings=(SLIGHT, TILT, nasty), basis="by simulation")
     assert found.lines([SLIGHT]) == [
-        "found:", f"  {TILT.title}: {TILT.sentence}", "left:", f"  distances: {nasty.text}", "ranges by simulation:", f"  missed: {needs[0].text}",
+        "found:", f"  {TILT.title}: {TILT.sentence}", "left:", f"  distances: {nasty.text}", "ranges by simulation:",
+        f"  missed: {needs[0].text}",
         f"  met: {needs[1].text}", f"NO: {found.reason}", f"next: {found.next_step}",
     ]  # fmt: skip
     assert "found:\n  lens model: it bends; measure the board\n" in found._repr_html_()
