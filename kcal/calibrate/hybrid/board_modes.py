@@ -19,7 +19,7 @@ from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.information import BOARD_SLOT
 
-BENDING, STRETCH, PRINT, TRAPEZOID = range(4)
+BENDING, STRETCH, PRINT, TRAPEZOID, CORNER = range(5)
 # Of modes whose amplitudes have a prior of their own.
 KNOWN = -1
 
@@ -31,7 +31,7 @@ class BoardModes(NamedTuple):
         shapes: (B, 3, N) displacement of each corner by a mode of amplitude one.
         unit: (B,) meters; amplitudes of a family are this times the same number.
         family: (B,) `BENDING`, `STRETCH` (with shear), `PRINT` or `TRAPEZOID`; `KNOWN` where the unit is
-            the standard deviation.
+            the standard deviation. `with_corners` has 2 N amplitudes more, of each corner in x, then in y: `CORNER`.
 
     Example:
         >>> grid = torch.cartesian_prod(torch.arange(7.0), torch.arange(6.0)).double()
@@ -43,6 +43,21 @@ class BoardModes(NamedTuple):
     shapes: Tensor
     unit: Tensor
     family: Tensor
+
+    @property
+    def displaced(self) -> bool:
+        """Whether each corner may be off its place beside the modes."""
+        return len(self.unit) > len(self.shapes)
+
+    def with_corners(self) -> BoardModes:
+        """The same modes, and each corner displaced by itself in the board's plane: fixed errors of print and paper."""
+        count, extent = 2 * self.shapes.shape[-1], float(self.unit.max())
+        unit, family = self.unit.new_full((count,), extent), self.family.new_full((count,), CORNER)
+        return self._replace(unit=torch.cat([self.unit, unit]), family=torch.cat([self.family, family]))
+
+    def without_corners(self) -> BoardModes:
+        """The modes alone."""
+        return self._replace(unit=self.unit[: len(self.shapes)], family=self.family[: len(self.shapes)])
 
     @property
     def heights(self) -> Tensor:

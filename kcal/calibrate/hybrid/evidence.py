@@ -279,6 +279,8 @@ _EXACTLY, _ROUGHLY = (1e-9, 1e-4), (5e-3, 0.05)
 _STEPS = 60
 # Lengths of its steps: first, longest, and that at which it gives up; curvature that is taken where there is less.
 _FIRST_STEP, _LONGEST, _SHORTEST, _FLAT = 2.0, 4.0, 1e-7, 0.05
+# Logarithm of an amplitude that is none.
+_NOWHERE = -40.0
 # ln σ² beyond which numbers overflow.
 _HIGHEST = 300.0
 
@@ -562,6 +564,17 @@ def evidence_of_motion(
         found = _best(one.data.tempered(tempering), families, best.h.numpy(), log_variance)
         losses.append(float(found.value) + 0.5 * one.log_determinant / tempering + view.unequal)
     return losses[0] - losses[1]
+
+
+def evidence_of_corners(
+    data: ViewData, best: Amplitudes, families: PriorFamilies, tempering: float, sizes: Sequence[float]
+) -> np.ndarray:
+    """Gain of the log evidence (nats) by corners displaced by each of these amplitudes, all others unchanged."""
+    h = best.h.numpy()[None].repeat(1 + len(sizes), 0)
+    h[:, -1] = [_NOWHERE, *np.log(sizes)]
+    still = data.integrated(best.log_ratio).data.tempered(tempering)
+    value = _best(still, families, h, np.full(len(h), math.log(best.variance))).value
+    return np.asarray(value[0] - value[1:])
 
 
 # How much the board bends in each view, relative to the others.

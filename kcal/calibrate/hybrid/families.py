@@ -16,11 +16,11 @@ from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.zernike import ZernikeModes
 
 # After the hyperparameters of the modes: ln amplitudes of the pupil (in units of the board's range) and of the board:
-# bending, stretch, print, trapezoid (in units of its extent): mean and sd of ln.
-_MEAN = np.log([2e-4, 5e-4, 5e-4, 2e-4, 2e-4])
-_SD = np.array([2.0, 1.5, 1.5, 1.5, 1.5])
-# Where the amplitudes of the board stand among the hyperparameters: the last four.
-BOARD = -4
+# bending, stretch, print, trapezoid, single corners (in units of its extent): mean and sd of ln.
+_MEAN = np.log([2e-4, 5e-4, 5e-4, 2e-4, 2e-4, 1e-4])
+_SD = np.array([2.0, 1.5, 1.5, 1.5, 1.5, 1.5])
+# Where the amplitudes of the board stand among the hyperparameters: the last five.
+BOARD = -5
 # Unknowns before the field's weights: focal length, principal point, shape, pupil; where the pupil stands among them.
 LEADING_UNKNOWNS, PUPIL = 6, slice(4, 6)
 # Unequal and skewed axes, in units of R: pixels are square.
@@ -70,14 +70,17 @@ class PriorFamilies(NamedTuple):
     decay: Tensor
     degree: Tensor
 
-    def with_board(self, board: BoardModes) -> PriorFamilies:
-        """The priors with other modes of the board, such as the same board in other variables."""
-        lens = len(self.mean) - len(board.unit)
-        family = torch.where(board.family == KNOWN, -1, self.amplitude[PUPIL.start] + 1 + board.family)
-        return self._replace(
-            log_unit=torch.cat([self.log_unit[:lens], board.unit.log()]),
-            amplitude=torch.cat([self.amplitude[:lens], family]),
-        )
+    def with_board(self, board: BoardModes, modes: int, hyper: int) -> PriorFamilies:
+        """The priors with another board, such as the same in other variables, in place of so many modes.
+
+        Args:
+            board: that the camera saw.
+            modes: amplitudes of the board that these priors are of.
+            hyper: number of the hyperparameters.
+        """
+        family, zero = torch.where(board.family == KNOWN, -1, hyper + BOARD + board.family), torch.zeros_like(board.unit)
+        own = (zero, board.unit.log(), family, torch.full_like(family, -1), zero)
+        return PriorFamilies(*(torch.cat([part[: len(part) - modes], new]) for part, new in zip(self, own, strict=True)))
 
     def deviation(self, h: Tensor) -> Tensor:
         """(..., S) prior standard deviations, of hyperparameters (..., H)."""

@@ -40,6 +40,7 @@ from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BENDS, BoardState, MotionSigma, Readout, motion_sigma, stillness, widening
 from kcal.calibrate.problem.views import among, information_of
 from kcal.errors import InputError
+from kcal.gaussian import triangular
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
 from kcal.lens.hybrid_terms import LEADING
@@ -135,6 +136,7 @@ class FitOptions:
         square: whether pixels are square; None: the views tell.
         motion: views may move while they are read; False: they stand still.
         bending: the board may bend by view, where the evidence says so; False: it is stiff.
+        corners: each corner of the board may be off its place by itself, where the evidence says so.
         focal: roughly known, pixels, for the start.
         robust: bound the weight of corners that are far off, so that a few wrong ones change nothing. Error bars of
             such a fit mean nothing; it tells which corners to leave out.
@@ -147,6 +149,7 @@ class FitOptions:
     square: bool | None = None
     motion: bool = True
     bending: bool = True
+    corners: bool = True
     focal: float | None = None
     robust: bool = False
     lens: LensPrior | None = None
@@ -198,6 +201,7 @@ def settle(
         robust=options.robust,
         exact=exact,
         heights=board_modes(ordered).heights if options.bending and start is None and not exact else None,
+        corners=options.corners and not exact and not options.robust,
     )
 
     def run(capture: FittedViews, estimate: Estimate, spent: int, *, cold: bool = False, rough: bool = rough) -> Rounds:
@@ -219,7 +223,7 @@ def settle(
             state, h = state._replace(board=known.in_units(state.board)), h.clone()
             # Nothing depends on them any more, so that they are no reason for another round.
             h[BOARD:] = hyperprior.mean[BOARD:]
-        families = estimate.families.with_board(shown)
+        families = estimate.families.with_board(shown, len(state.board), len(h))
         estimate = estimate._replace(families=families, state=state, amplitudes=estimate.amplitudes._replace(h=h))
         return run(capture, estimate, start.iterations)
     undecided = square is None and lens is None
@@ -314,6 +318,7 @@ class HybridFit:
         readout: how views move while they are read, and how the board bends in them; None: neither.
         log_ratio: logarithms of standard deviations over the noise: of motions as in `MotionSigma`, and of bending.
         relative: (V,) how much the board bends in each view, relative to the others; None: it is stiff.
+        displaced: (N, 2) meters by which corners are off their places beside these modes; None: no evidence of it.
         board_shapes: modes of the board.
         board_points: (N, 3) meters, the board as it was measured.
         residuals: (V, N, 2) projected minus observed, pixels, weights left out; NaN where a corner did not count.
@@ -353,6 +358,7 @@ class HybridFit:
     readout: Readout | None
     log_ratio: np.ndarray
     relative: Tensor | None
+    displaced: Tensor | None
     board_shapes: BoardModes
     board_points: Tensor
     residuals: Tensor
@@ -397,6 +403,7 @@ class HybridFit:
     def problem(self, points: Tensor, pixels: Tensor, weights: Tensor, mean: Tensor, precision: Tensor) -> BoardProblem:
         """The least-squares problem of this lens, board and motion, for given data and priors; see `hybrid_problem`."""
         shapes = self.board_shapes.shapes
+        points = points if self.displaced is None else points + torch.nn.functional.pad(self.displaced, (0, 1))
         return hybrid_problem(
             points, shapes, pixels, weights, self.model, mean, precision, self.readout, self.own_stillness, self.square
         )
@@ -504,8 +511,20 @@ def fit_hybrid(
         parameters[5 + len(LEADING) :][unfelt] = families.mean[field][unfelt]
         estimate = estimate._replace(state=state._replace(parameters=parameters))
     problem, estimate, steps = capture.solved(estimate, LAST, last_step=True, held=held)
+    reduced, displaced = problem.reduced_rows(estimate.state), None
+    if capture.board.displaced:
+        # From here on they are integrated out, at their best.
+        count, modes = 2 * len(points), capture.board.without_corners()
+        offset, weight = estimate.state.board[-count:], math.sqrt(variance) / families.deviation(h)[-count:]
+        prior = torch.cat([torch.diag(weight), reduced.new_zeros(count, len(reduced) - count - 1)], 1)
+        prior = torch.cat([prior, (weight * offset)[:, None]], 1)
+        reduced = torch.cat([reduced[:, -1 - count : -1], reduced[:, : -1 - count], reduced[:, -1:]], 1)
+        reduced = triangular(torch.cat([reduced, prior]))[count:, count:]
+        displaced, held = offset.view(2, -1).T, held[:-count]
+        moved = capture.points + torch.nn.functional.pad(displaced, (0, 1))
+        capture, estimate = dataclasses.replace(capture, points=moved, board=modes), estimate.with_board(modes)
+        problem, families = capture.problem(estimate, held), estimate.families
     state = estimate.state
-    reduced = problem.reduced_rows(state)
     K = products_of(reduced[:, :-1].T)
     deviation = torch.where(held, 0.0, families.deviation(h))
     inverse = posterior_root(K, deviation, variance)
@@ -537,9 +556,11 @@ def fit_hybrid(
         readout=capture.readout,
         log_ratio=log_ratio,
         relative=relative,
+        displaced=displaced,
         effective=len(deviation) - float(inverse.square().sum()),
         board_shapes=own,
-        board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes),
+        board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes)
+        + (0.0 if displaced is None else torch.nn.functional.pad(displaced, (0, 1))),
         residuals=capture.by_corner(errors),
         weights=weights,
         weighted_rms=math.nan,

@@ -18,6 +18,7 @@ from kcal.calibrate.hybrid.evidence import (
     WORTH,
     Amplitudes,
     ViewData,
+    evidence_of_corners,
     evidence_of_motion,
     expected_maximum,
     maximize_evidence,
@@ -72,6 +73,7 @@ def hybrid_problem(
     stillness: Tensor | None = None,
     square: bool = True,
     turning: bool = False,
+    displaced: bool = False,
 ) -> BoardProblem:
     """Residuals of boards under a hybrid lens, with a normal prior on each unknown of lens and board.
 
@@ -87,19 +89,21 @@ def hybrid_problem(
         stillness: (M,) or (V, M) the squared noise over the variance of each of these numbers.
         square: whether pixels are square; others have two focal lengths.
         turning: points are (V, N, 3) and infinitely far, so that poses are rotations.
+        displaced: each corner is off its place by unknowns of its own, the last ones.
     """
     held = torch.isinf(precision)
     return BoardProblem(
         points, pixels, model, hybrid_unknowns(model, square), shapes=shapes, free_board=True, held=held,
-        weights=weights, terms=[hybrid_prior(model, len(shapes), mean, precision, square)], readout=readout,
-        stillness=stillness, turning=turning,
+        weights=weights, terms=[hybrid_prior(model, mean, precision, square)], readout=readout, stillness=stillness,
+        turning=turning, displaced=displaced,
     )  # fmt: skip
 
 
-def hybrid_prior(model: LensModel, shapes: int, mean: Tensor, precision: Tensor, square: bool = True) -> GaussianPrior:
-    """The prior of `hybrid_problem`, with so many modes of the board."""
+def hybrid_prior(model: LensModel, mean: Tensor, precision: Tensor, square: bool = True) -> GaussianPrior:
+    """The prior of `hybrid_problem`."""
     leading, count, held = hybrid_unknowns(model, square).leading, 5 + model.size, torch.isinf(precision)
-    index = torch.cat([torch.tensor(leading), torch.arange(count, count + shapes)])[~held]
+    board = torch.arange(count, count + len(mean) - len(leading))
+    index = torch.cat([torch.tensor(leading), board])[~held]
     return GaussianPrior(index, mean[~held], precision[~held].sqrt())
 
 
@@ -140,6 +144,13 @@ class Estimate(NamedTuple):
         """The squared noise over the variance of each number of a view."""
         return stillness(self.amplitudes.log_ratio, self.relative)
 
+    def with_board(self, board: BoardModes) -> Estimate:
+        """The same with corners that are displaced by themselves, not at first, or no longer."""
+        old, new = self.state.board, len(board.unit)
+        families = self.families.with_board(board, len(old), len(self.amplitudes.h))
+        moved = torch.nn.functional.pad(old, (0, new - len(old)))
+        return self._replace(families=families, state=self.state._replace(board=moved))
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class FittedViews:
@@ -157,6 +168,7 @@ class FittedViews:
         robust: bound the weight of corners that are far off.
         exact: the board does not differ.
         heights: (12, N) of the corners by which the board may bend by view, meters, if the evidence says so, or None.
+        corners: whether each may be off its place on the board by itself, if the evidence says so.
         turning: views show points (V, N, 3) that are infinitely far, such as stars: poses are rotations, nothing
             depends on the pupil, and errors do not repeat within a view.
         known: what other data say of the lens, by the numbers of its unknowns, in standard deviations as weighted
@@ -174,6 +186,7 @@ class FittedViews:
     robust: bool = False
     exact: bool = False
     heights: Tensor | None = None
+    corners: bool = False
     turning: bool = False
     known: Gaussian | None = None
 
@@ -238,10 +251,10 @@ class FittedViews:
         else:
             problem = hybrid_problem(
                 self.points, self.board.shapes, self.pixels, self.weights, estimate.model, estimate.families.mean,
-                precision, self.readout, still, self.square, self.turning,
+                precision, self.readout, still, self.square, self.turning, self.board.displaced,
             ).read_as_shown(estimate.state)  # fmt: skip
         kept[:] = [(estimate.model, fixed, problem)]
-        prior = hybrid_prior(estimate.model, len(self.board.shapes), estimate.families.mean, precision, self.square)
+        prior = hybrid_prior(estimate.model, estimate.families.mean, precision, self.square)
         problem = problem.with_priors([prior, *self._told(estimate.model)], still)
         if self.robust:
             return problem.with_weights(_cauchy_weights(problem, estimate.state, self.weights))
@@ -305,6 +318,8 @@ _FIRST, _LATER, LAST = (8, 0.1), (12, 0.02), (60, 0.01)
 _REWEIGHED = 3
 # Nats by which the evidence may fall from one round to another, because the problem is not linear.
 _DRIFT = 5.0
+# Rounds that single corners need to settle.
+_ANEW = 3
 # Motions beyond this stand for something else.
 _TOO_MUCH = 0.5 * LARGEST
 # Hyperparameters have converged when none, nor the logarithm of the tempering, changes by more.
@@ -319,6 +334,8 @@ _UNFELT, _SCALE = 0.02, 0.5
 _MOVING = 3e-3
 # Standard deviations of bending, in extents of the board, with which it is tried.
 _BENT = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
+# The same of displacements of single corners.
+_DISPLACED = (2e-5, 6e-5, 2e-4, 6e-4, 2e-3)
 
 
 class Rounds(NamedTuple):
@@ -399,6 +416,31 @@ def _with_bending(capture: FittedViews, estimate: Estimate) -> tuple[FittedViews
         trials.append((evidence_of_motion(data, trial, estimate.families, estimate.tempering, number), sigma, trial))
     gained, _, trial = max(trials, key=lambda found: found[:2])
     return (wider, bent._replace(amplitudes=trial, tempering=1.0)) if gained >= WORTH else None
+
+
+def _with_corners(capture: FittedViews, estimate: Estimate) -> tuple[FittedViews, Estimate] | None:
+    """Views and estimate with each corner displaced by itself, or with none again; None where all stays as it is.
+
+    Decided from one linearization, as `_with_bending` does.
+    """
+    if not capture.corners:
+        return None
+    if capture.board.displaced:
+        data, best = capture.data(capture.problem(estimate), estimate), estimate.amplitudes
+        sizes = [math.exp(float(best.h[-1]))]
+        if float(evidence_of_corners(data, best, estimate.families, estimate.tempering, sizes)[0]) >= WORTH:
+            return None
+        board = capture.board.without_corners()
+        return dataclasses.replace(capture, board=board, corners=False), estimate.with_board(board)
+    wider = dataclasses.replace(capture, board=capture.board.with_corners())
+    trial, best = estimate.with_board(wider.board), estimate.amplitudes
+    data = wider.data(wider.problem(trial), trial)
+    gained = evidence_of_corners(data, best, trial.families, estimate.tempering, _DISPLACED)
+    if not gained.max() >= WORTH:
+        return None
+    h = best.h.clone()
+    h[-1] = math.log(_DISPLACED[int(gained.argmax())])
+    return wider, trial._replace(amplitudes=best._replace(h=h))
 
 
 def run_rounds(
@@ -492,6 +534,12 @@ def run_rounds(
                 capture = dataclasses.replace(capture, readout=less if less.numbers else None, heights=heights)
                 estimate = begin_motion(capture, estimate)
                 continue
+        # A rough fit is followed by one that asks.
+        if (resting or turn == _ROUNDS // 2) and not rough and turn < _ROUNDS - _ANEW:
+            other = _with_corners(capture, estimate)
+            if other is not None:
+                (capture, estimate), top = other, None
+                continue
         if resting:
             converged = True
             break
@@ -559,7 +607,9 @@ def _moved_by(old: Amplitudes, new: Amplitudes) -> float:
 def _overdispersion(data: ViewData, estimate: Estimate, capture: FittedViews) -> float:
     deviation, ratio = torch.where(capture.held(estimate), 0.0, estimate.deviation), estimate.amplitudes.log_ratio
     K = data.integrated(ratio).data.K
-    return overdispersion(data.scores(ratio), K, deviation, estimate.variance)
+    # Single corners do not repeat within a view, and there are many.
+    own = slice(len(deviation) - len(estimate.state.board) + len(capture.board.shapes))
+    return overdispersion(data.scores(ratio)[:, own], K[own, own], deviation[own], estimate.variance)
 
 
 # Poses and motions of views that were held out, under a camera and a board that stay as they are.

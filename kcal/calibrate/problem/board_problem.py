@@ -149,6 +149,8 @@ class BoardProblem(SchurProblem[BoardState]):
         stillness: (M,) or (V, M) the squared noise over the variance of each of these numbers.
         batch: leading shape of the states, () for one solve.
         turning: the points are so far away that views differ by their rotations alone; translations are held.
+        displaced: whether each corner lies off its place on the board by unknowns of its own in x and y, meters: 2 N
+            more amplitudes, those in x first, after those of the modes. Not in batches, nor with a loss.
 
     Attributes:
         weights: (..., V, K) or (..., V, 2, 2, K).
@@ -192,6 +194,7 @@ class BoardProblem(SchurProblem[BoardState]):
         stillness: Tensor | None = None,
         batch: tuple[int, ...] = (),
         turning: bool = False,
+        displaced: bool = False,
     ) -> None:
         self.model, self.loss, self.batch = model, loss, batch
         self.free, self.free_board = FreeParameters.of(free), free_board
@@ -213,7 +216,9 @@ class BoardProblem(SchurProblem[BoardState]):
         own = board_points.ndim > 2
         self._board = self.shown(board_points).mT.contiguous() if own else self._of_board(board_points.mT)
         self._shapes = self._of_board(self.shapes)
-        self.unknown_count = len(self.free) + len(self.shapes) * free_board
+        self.displaced = displaced
+        self.amplitudes = len(self.shapes) + 2 * board_points.shape[-2] * displaced
+        self.unknown_count = len(self.free) + self.amplitudes * free_board
         self.joint = not model.hybrid
         self._shown: list[tuple[BoardState, _Imaged]] = []
         self._slots = torch.tensor(self.free.slots, dtype=torch.long, device=pixels.device)
@@ -282,7 +287,11 @@ class BoardProblem(SchurProblem[BoardState]):
     def _placed(self, state: BoardState, views: slice = ALL) -> _Placed:
         flat = _of_views(self._board, views)
         if len(self.shapes) and (self.free_board or bool(state.board.any())):
-            flat = flat + torch.einsum("...b,vbkn->...vkn", state.board, _of_views(self._shapes, views))
+            amplitudes = state.board[..., : len(self.shapes)]
+            flat = flat + torch.einsum("...b,vbkn->...vkn", amplitudes, _of_views(self._shapes, views))
+        if self.displaced:
+            moved = state.board[len(self.shapes) :].view(2, -1)
+            flat = flat + _of_views(self._of_board(torch.nn.functional.pad(moved, (0, 0, 0, 1))), views)
         if self.readout is None:
             rotated = state.rotation @ flat
             return _Placed(flat, rotated, rotated + state.translation[..., None], None)
@@ -365,6 +374,25 @@ class BoardProblem(SchurProblem[BoardState]):
         With `memory` given, an empty list at first, the next call may overwrite what this one returns: new memory costs
         as much time as what is written there.
         """
+        rows, slopes = self._own_rows(state, views, memory)
+        if not self.displaced:
+            return rows.flatten(-2)
+        # Each residual depends on the displacement of its own corner alone.
+        each = torch.einsum("vaun,nm->vamun", slopes, torch.eye(slopes.shape[-1], dtype=slopes.dtype))
+        each = self._by_number(each.movedim(2, -1)).movedim(-1, 2).flatten(1, 2)
+        return torch.cat([rows[:, :-1], each, rows[:, -1:]], 1).flatten(-2)
+
+    def _by_number(self, values: Tensor) -> Tensor:
+        """(V, ..., N) of values (V, ..., K); 0 for corners that no work is done on."""
+        if self._numbers is None:
+            return values
+        numbers = self._numbers.view(len(values), *[1] * (values.ndim - 2), -1).expand_as(values)
+        return values.new_zeros(*values.shape[:-1], self.board_points.shape[-2]).scatter(-1, numbers, values)
+
+    def _own_rows(
+        self, state: BoardState, views: slice, memory: list[Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Rows (..., V, L + S + 1, 2, K) without displacements of the corners; derivatives (V, 2, 2, K) by these."""
         placed, seen, rotation, _ = self._imaged(state, views)
         error = seen.pixels - self._target[..., views, :, :]
         if self.joint:
@@ -374,7 +402,7 @@ class BoardProblem(SchurProblem[BoardState]):
             self._counted(part, views) for part in (seen.by_point, seen.by_camera, error[..., None, :, :])
         )
         L, count = self.local_size, len(self.free)
-        rows = self._memory(by_point, L + self.unknown_count + 1, memory)
+        rows = self._memory(by_point, L + count + len(self.shapes) * self.free_board + 1, memory)
         rows[..., : self.pose, :, :] = step_rows(by_point, placed.rotated)[..., : self.pose, :, :]
         if self.readout is not None:
             readout, time = self.readout.of_views(views), self._time[views]
@@ -384,6 +412,7 @@ class BoardProblem(SchurProblem[BoardState]):
         shared.index_fill_(-3, slots, 0.0).index_add_(-3, slots, by_camera)
         if len(slots) < len(self._slots):
             self._fill_field(shared, seen, state, views)
+        by_board = by_point
         if self.free_board:
             by_board = (rotation.mT @ by_point.flatten(-2)).unflatten(-1, (2, -1))
             if placed.turn is not None:
@@ -395,7 +424,7 @@ class BoardProblem(SchurProblem[BoardState]):
         rows[..., -1:, :, :] = error
         if self.loss is not None:
             rows = rows * self.loss.weight(error.square().sum(-2)).sqrt()[..., None, :]
-        return rows.flatten(-2)
+        return rows, by_board[..., :2, :, :]
 
     def _memory(self, like: Tensor, count: int, memory: list[Tensor] | None) -> Tensor:
         """(..., V, count, 2, K), of one camera such that each column is in one piece."""
@@ -425,10 +454,10 @@ class BoardProblem(SchurProblem[BoardState]):
 
     def _places(self, coefficients: int) -> Tensor:
         """(5 + P + B,) the place of each of `values` among the unknowns of a step; -1 where it has none."""
-        slots = torch.full((len(INTRINSICS) + coefficients + len(self.shapes),), -1)
+        slots = torch.full((len(INTRINSICS) + coefficients + self.amplitudes,), -1)
         slots[list(self.free.indices)] = torch.tensor(self.free.slots, dtype=torch.long)
         if self.free_board:
-            slots[len(slots) - len(self.shapes) :] = torch.arange(len(self.free), self.unknown_count)
+            slots[len(slots) - self.amplitudes :] = torch.arange(len(self.free), self.unknown_count)
         # One more, for values that are no unknowns.
         place = torch.full((self.unknown_count + 1,), -1)
         place[self.moving] = torch.arange(self.shared_size)
@@ -558,40 +587,68 @@ class BoardProblem(SchurProblem[BoardState]):
         if self._kept and self._kept[0][0] is state:
             return self._kept[0][1]
         memory: list[Tensor] = []
-        found = Products.together(
-            [
-                Products.of_rows(part.corner_rows(own, at, memory), self.local_size)
-                for part, own, at in self._parts(state)
-            ]
-        )
+        found = Products.together([part._products(own, at, memory) for part, own, at in self._parts(state)])
         if not self._all_move:
             found = found.of_shared(self.moving)
         if not found.total.requires_grad:
             self._kept[:] = [(state, found)]
         return found
 
+    def _products(self, state: BoardState, views: slice, memory: list[Tensor]) -> Products:
+        rows, slopes = self._own_rows(state, views, memory)
+        local, right, score, total = Products.of_rows(rows.flatten(-2), L := self.local_size)
+        if self.displaced:
+            # Corners meet lens, poses and residuals only in their own rows: these products cost little.
+            with_rows = self._by_number(torch.einsum("vsun,vaun->vsan", rows, slopes)).flatten(2)
+            own = self._by_number(torch.einsum("vaun,vbun->vabn", slopes, slopes)).sum(0)
+            own = torch.einsum("abn,nm->anbm", own, torch.eye(own.shape[-1], dtype=own.dtype)).flatten(2).flatten(0, 1)
+            beside = with_rows[:, L:].sum(0)
+            right = torch.cat([right[..., :-1], with_rows[:, :L], right[..., -1:]], -1)
+            score = torch.cat([score[..., :-1], with_rows[:, -1], score[..., -1:]], -1)
+            above, below = total.split([len(total) - 1, 1])
+            total = torch.cat(
+                [
+                    torch.cat([above[:, :-1], beside[:-1], above[:, -1:]], 1),
+                    torch.cat([beside[:-1].T, own, beside[-1:].T], 1),
+                    torch.cat([below[:, :-1], beside[-1:], below[:, -1:]], 1),
+                ]
+            )
+        return Products(local, right, score, total)
+
     def linearize(self, state: BoardState) -> SchurLinearization:
         """See `Problem.linearize`; by the unknowns that are not held."""
-        by_pose, by_both, _, by_corners = self.products(state)
-        total = self.shared_gram(state) + by_corners
-        if self.readout is not None:
-            # The prior of motions.
-            pull = self._still * state.motion
-            by_pose, by_both = by_pose.clone(), by_both.clone()
-            by_pose.diagonal(dim1=-2, dim2=-1)[..., self.pose :] += self._still
-            by_both[..., self.pose :, -1] += pull
-            total[..., -1, -1] += (pull * state.motion).sum((-2, -1))
-        linear = SchurLinearization(by_pose, by_both, total)
+        by_pose, by_both, _, total = self._with_motion(state)
+        linear = SchurLinearization(by_pose, by_both, self.shared_gram(state) + total)
         if self.loss is not None:
             linear.cost = self.cost(state)
         return linear
+
+    def _with_motion(self, state: BoardState) -> Products:
+        """The products with the prior of motions."""
+        found = self.products(state)
+        if self.readout is None:
+            return found
+        pull = self._still * state.motion
+        by_pose, by_both, total = found.local.clone(), found.right.clone(), found.total.clone()
+        by_pose.diagonal(dim1=-2, dim2=-1)[..., self.pose :] += self._still
+        by_both[..., self.pose :, -1] += pull
+        total[..., -1, -1] += (pull * state.motion).sum((-2, -1))
+        return Products(by_pose, by_both, found.score, total)
 
     def off_poses(self, state: BoardState) -> Tensor:
         """(V, S + 1, R) derivatives by the shared unknowns, and residuals, off what poses and motions can do (QR)."""
         return torch.cat([without_local(self.rows(state, views), self.local_size) for views in self._chunks(state)])
 
     def reduced_rows(self, state: BoardState) -> Tensor:
-        """(S + 1, S + 1) triangle with the same products as the rows of `off_poses`, some views at a time."""
+        """(S + 1, S + 1) rows with the same products as those of `off_poses`, some views at a time; as a rule a triangle."""
+        if self.displaced:
+            # Of hundreds of unknowns more, to the precision of products.
+            total = self._with_motion(state).off(self.local_size).total
+            scale = total.diagonal().clamp_min(torch.finfo(total.dtype).tiny).sqrt()
+            values, vectors = torch.linalg.eigh(total / scale / scale[:, None])
+            kept = torch.cat([self.moving, torch.tensor([self.unknown_count])])
+            rows = total.new_zeros(len(total), self.unknown_count + 1)
+            return rows.index_copy(1, kept, values.clamp_min(0.0).sqrt()[:, None] * vectors.T * scale)
         parts = [
             triangular(without_local(part.rows(own, at), self.local_size).transpose(0, 1).flatten(1).T)
             for part, own, at in self._parts(state)
