@@ -15,7 +15,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.lens import pixel_covariance
-from kcal.sim.captures import PoseOptions, PrintedBoard, drawn_lens, sample_board_poses
+from kcal.sim.captures import BoardLike, PoseOptions, PrintedBoard, drawn_lens, sample_board_poses
 from kcal.sim.truth import TruthLens
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
@@ -48,6 +48,7 @@ def simulated(
     take: int = 0,
     bent: float = 0.0,
     share: float = 1.0,
+    board: BoardLike | None = None,
 ) -> Simulated:
     """Draw a lens, a printed board and views of it; lens and what is held follow from the seed in turn.
 
@@ -61,12 +62,13 @@ def simulated(
         take: another one has other poses, motions and noise, and the same lens and board.
         bent: meters by which the board bends about an axis of its own in each view (standard deviation).
         share: of the views in which it does; in the others it is stiff.
+        board: with the corners of `BOARD`, in place of an ordinary print.
     """
     lens = drawn_lens(PRESCRIPTIONS[LENSES[seed % len(LENSES)]], 1.0, seed, wander=1.0)
     hands = Hands(holds="camera" if seed // len(LENSES) % 2 else "board") if by_hand else None
     generator, options = torch.Generator().manual_seed(1000 + seed + 10**6 * take), PoseOptions(max_roll=max_roll)
     poses = sample_board_poses(quick(lens), BOARD, views, generator, fill=FILL, options=options)
-    board = PrintedBoard(BOARD.columns, BOARD.rows, BOARD.square, seed)
+    board = board or PrintedBoard(BOARD.columns, BOARD.rows, BOARD.square, seed)
     heights = bends(views, bent, share, torch.Generator().manual_seed(9000 + seed)) if bent else None
     truth = moving_capture(
         lens, poses, sigma=sigma, seed=1000 + seed + 10**6 * take, hands=hands, board=board, heights=heights
@@ -160,8 +162,12 @@ def told(result: CameraCalibrationResult) -> Record:
 def terms(fit: HybridFit) -> list[str]:
     """What views were found to do."""
     readout = fit.readout
-    bends = getattr(readout, "bends", None) is not None
-    return ["motion"] * (readout is not None and getattr(readout, "moves", True)) + ["bending"] * bends
+    found = {
+        "motion": readout is not None and getattr(readout, "moves", True),
+        "bending": getattr(readout, "bends", None) is not None,
+        "corners": getattr(fit, "displaced", None) is not None,
+    }
+    return [name for name, here in found.items() if here]
 
 
 def figures(result: CameraCalibrationResult, case: Simulated, pixels: Tensor, errors: Tensor) -> Record:

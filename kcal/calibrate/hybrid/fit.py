@@ -516,8 +516,8 @@ def fit_hybrid(
         # From here on they are integrated out, at their best.
         count, modes = 2 * len(points), capture.board.without_corners()
         offset, weight = estimate.state.board[-count:], math.sqrt(variance) / families.deviation(h)[-count:]
-        prior = torch.cat([torch.diag(weight), reduced.new_zeros(count, len(reduced) - count - 1)], 1)
-        prior = torch.cat([prior, (weight * offset)[:, None]], 1)
+        prior = torch.nn.functional.pad(torch.diag(weight), (0, reduced.shape[1] - count))
+        prior[:, -1] = weight * offset
         reduced = torch.cat([reduced[:, -1 - count : -1], reduced[:, : -1 - count], reduced[:, -1:]], 1)
         reduced = triangular(torch.cat([reduced, prior]))[count:, count:]
         displaced, held = offset.view(2, -1).T, held[:-count]

@@ -120,7 +120,7 @@ class TestFleets:
         assert families.decay[-28:].tolist() == [-1] * 28
         # Of a measured board: as sure as it is.
         told = board._replace(unit=torch.full((28,), 0.3).double(), family=torch.full((28,), KNOWN))
-        other = families.with_board(told)
+        other = families.with_board(told, 28, len(typical_hyperprior(MODES).mean))
         torch.testing.assert_close(
             other.deviation(typical_hyperprior(MODES).mean)[-28:], torch.full((28,), 0.3).double()
         )
