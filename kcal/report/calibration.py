@@ -214,11 +214,13 @@ def board_text(board: MeasuredBoard) -> list[str]:
     def text(found: Measured, scale: float, unit: str) -> str:
         return measured_text(scale * found.value, scale * found.sigma, unit)
 
+    single = f"single corners {number_text(1e3 * board.corner_error)} mm RMS, beside all this"
     return [
         f"bending {text(board.bending, 1e3, 'mm')} (height over the best plane, at most)",
         f"stretch {text(board.stretch, 100.0, '%')} (width over height)",
         f"shear {text(board.shear, 100.0, '%')}",
         f"print error {text(board.print_error, 1e3, 'mm')} RMS, beyond stretch and shear",
+        *([single] if board.corner_error else []),
     ]
 
 

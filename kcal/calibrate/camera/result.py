@@ -425,6 +425,7 @@ class CameraCalibrationResult(ArrowRows):
             amplitudes=self.hybrid.state.board,
             half=torch.linalg.qr(own, mode="r").R,
             log_evidence=0.0,
+            corners=self.hybrid.displaced,
         )
 
     @property

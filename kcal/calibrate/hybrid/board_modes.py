@@ -142,6 +142,16 @@ def turned_corners(values: Tensor, board: Board, turns: Tensor) -> Tensor:
     return torch.stack([view[orders[k]] for view, k in zip(values, turns.tolist(), strict=True)])
 
 
+def turned_corner_offsets(offsets: Tensor, board: Board, turns: int) -> Tensor:
+    """(N, 2) displacements of the corners after quarter turns of the board, from those before."""
+    back = torch.linalg.matrix_power(_QUARTER[:2, :2], turns)
+    return turned_corners(offsets[None], board, torch.tensor([turns]))[0] @ back.T
+
+
+# The corner at the end of the first row comes first: x becomes -y, y becomes x.
+_QUARTER = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
 def mode_turn(turns: int) -> Tensor:
     """(B, B) amplitudes of a board after quarter turns, from those before; shifts, turns and scale do not count.
 
@@ -152,9 +162,7 @@ def mode_turn(turns: int) -> Tensor:
     # Amplitudes refer to half the board's sides, so that any square board gives the same, and half turns any board.
     board = Board(columns=8, rows=8, square=2.0 / 7.0)
     order = turned_corners(torch.arange(board.corners)[None], board, torch.tensor([turns]))[0]
-    # The corner at the end of the first row comes first: x becomes -y, y becomes x.
-    quarter = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    back = torch.linalg.matrix_power(quarter, turns)
+    back = torch.linalg.matrix_power(_QUARTER, turns)
     shapes = board_modes(board.points).shapes
     basis = torch.cat([shapes, undetermined_modes(board.points)]).flatten(1).T
     turned = torch.einsum("kl,bln->bkn", back, shapes[:, :, order]).flatten(1).T

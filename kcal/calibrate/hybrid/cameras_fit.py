@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.board_modes import CLEAR, find_turns, turned, turned_corners
+from kcal.calibrate.hybrid.board_modes import CLEAR, find_turns, turned, turned_corner_offsets, turned_corners
 from kcal.calibrate.hybrid.evidence import Quadratic, negative_log_evidence
 from kcal.calibrate.hybrid.families import (
     BOARD,
@@ -446,7 +446,7 @@ def fit_cameras(
             if shape == "printed" and same is not None:
                 if camera.board not in printed:
                     printed[camera.board], _ = printed_board(camera.fit.board_shapes, [camera.message, same])
-                shape = BoardPrior(printed[camera.board], same)
+                shape = BoardPrior(printed[camera.board], same, _corners_of(camera.board, sets, cameras, fitted, i))
             if fleet or shape is not alone:
                 # Views that were turned since, and lenses of another form, have other unknowns.
                 kept = lenses[i] is None and torch.equal(camera.turns, fitted[i])
@@ -458,7 +458,8 @@ def fit_cameras(
     if isinstance(board, MeasuredBoard):
         boards = [board]
     else:
-        boards = [_measured(k, sets, names, cameras) for k in range(1 + max(camera.board for camera in cameras))]
+        numbers = range(1 + max(camera.board for camera in cameras))
+        boards = [_measured(k, sets, names, cameras, fitted) for k in numbers]
     return CamerasFit(cameras=tuple(cameras), boards=tuple(boards), lens=lens)
 
 
@@ -527,7 +528,11 @@ def _learned_fleet(cameras: Sequence[CameraFit], typical: LensPrior) -> tuple[Le
 
 
 def _measured(
-    index: int, sets: Sequence[Observations], names: Sequence[str], cameras: Sequence[CameraFit]
+    index: int,
+    sets: Sequence[Observations],
+    names: Sequence[str],
+    cameras: Sequence[CameraFit],
+    fitted: Sequence[Tensor],
 ) -> MeasuredBoard:
     """One of the boards, from all that saw it."""
     members = [i for i, camera in enumerate(cameras) if camera.board == index]
@@ -543,4 +548,18 @@ def _measured(
         half=half,
         log_evidence=log_evidence - flat,
         observations=tuple(names[i] for i in members),
+        corners=_corners_of(index, sets, cameras, fitted),
     )
+
+
+def _corners_of(
+    board: int, sets: Sequence[Observations], cameras: Sequence[CameraFit], fitted: Sequence[Tensor], but: int = -1
+) -> Tensor | None:
+    """(N, 2) by which corners of a board are off their places, the mean over all cameras that found it but one."""
+    found = []
+    for i, (seen, camera, turns) in enumerate(zip(sets, cameras, fitted, strict=True)):
+        if camera.board == board and i != but and camera.fit.displaced is not None:
+            # A whole camera may have been turned since it was fitted.
+            turn = int((camera.turns - turns)[0]) % 4
+            found.append(turned_corner_offsets(camera.fit.displaced, seen.board, turn))
+    return torch.stack(found).mean(0) if found else None

@@ -34,7 +34,7 @@ from kcal.calibrate.hybrid.fitted_views import (
     motion_is_worth,
     run_rounds,
 )
-from kcal.calibrate.hybrid.measured_board import BoardPrior, MeasuredBoard
+from kcal.calibrate.hybrid.measured_board import BoardPrior, MeasuredBoard, off_by
 from kcal.calibrate.hybrid.network_fit import FieldTraining, train_network
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BENDS, BoardState, MotionSigma, Readout, motion_sigma, stillness, widening
@@ -403,9 +403,8 @@ class HybridFit:
     def problem(self, points: Tensor, pixels: Tensor, weights: Tensor, mean: Tensor, precision: Tensor) -> BoardProblem:
         """The least-squares problem of this lens, board and motion, for given data and priors; see `hybrid_problem`."""
         shapes = self.board_shapes.shapes
-        points = points if self.displaced is None else points + torch.nn.functional.pad(self.displaced, (0, 1))
         return hybrid_problem(
-            points, shapes, pixels, weights, self.model, mean, precision, self.readout, self.own_stillness, self.square
+            off_by(points, self.displaced), shapes, pixels, weights, self.model, mean, precision, self.readout, self.own_stillness, self.square
         )
 
     def residuals_of(self, pixels: Tensor) -> Tensor:
@@ -511,7 +510,7 @@ def fit_hybrid(
         parameters[5 + len(LEADING) :][unfelt] = families.mean[field][unfelt]
         estimate = estimate._replace(state=state._replace(parameters=parameters))
     problem, estimate, steps = capture.solved(estimate, LAST, last_step=True, held=held)
-    reduced, displaced = problem.reduced_rows(estimate.state), None
+    reduced, displaced = problem.reduced_rows(estimate.state), None if known is None else known.corners
     if capture.board.displaced:
         # From here on they are integrated out, at their best.
         count, modes = 2 * len(points), capture.board.without_corners()
@@ -520,9 +519,10 @@ def fit_hybrid(
         prior[:, -1] = weight * offset
         reduced = torch.cat([reduced[:, -1 - count : -1], reduced[:, : -1 - count], reduced[:, -1:]], 1)
         reduced = triangular(torch.cat([reduced, prior]))[count:, count:]
-        displaced, held = offset.view(2, -1).T, held[:-count]
-        moved = capture.points + torch.nn.functional.pad(displaced, (0, 1))
-        capture, estimate = dataclasses.replace(capture, points=moved, board=modes), estimate.with_board(modes)
+        own_offset, held = offset.view(2, -1).T, held[:-count]
+        displaced = own_offset if displaced is None else displaced + own_offset
+        capture = dataclasses.replace(capture, points=off_by(capture.points, own_offset), board=modes)
+        estimate = estimate.with_board(modes)
         problem, families = capture.problem(estimate, held), estimate.families
     state = estimate.state
     K = products_of(reduced[:, :-1].T)
@@ -559,8 +559,7 @@ def fit_hybrid(
         displaced=displaced,
         effective=len(deviation) - float(inverse.square().sum()),
         board_shapes=own,
-        board_points=ordered + torch.einsum("b,bkn->nk", state.board, own.shapes)
-        + (0.0 if displaced is None else torch.nn.functional.pad(displaced, (0, 1))),
+        board_points=off_by(ordered + torch.einsum("b,bkn->nk", state.board, own.shapes), displaced),
         residuals=capture.by_corner(errors),
         weights=weights,
         weighted_rms=math.nan,

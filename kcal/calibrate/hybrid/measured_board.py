@@ -29,16 +29,24 @@ from kcal.texts import brief
 # evidence.
 
 
+def off_by(points: Tensor, corners: Tensor | None) -> Tensor:
+    """Points (N, 3) that are displaced in the board's plane (N, 2), or not."""
+    return points if corners is None else points + torch.nn.functional.pad(corners, (0, 1))
+
+
 class BoardPrior(NamedTuple):
     """What is known of a board before a camera is calibrated.
 
     Attributes:
         own: as it was printed, or as it was measured.
         told: what other cameras say of a printed one; None: it was measured.
+        corners: (N, 2) meters by which corners are off their places beside the modes, as others found; None: they tell
+            nothing of it.
     """
 
     own: Gaussian
     told: Gaussian | None = None
+    corners: Tensor | None = None
 
     @property
     def whole(self) -> Gaussian:
@@ -56,7 +64,7 @@ class BoardPrior(NamedTuple):
         shapes = torch.einsum("ab,bkn->akn", half, modes.shapes)
         unit = torch.ones_like(modes.unit)
         known = BoardModes(shapes, unit, torch.full_like(modes.family, KNOWN))
-        return points + torch.einsum("b,bkn->nk", mean, modes.shapes), known
+        return off_by(points + torch.einsum("b,bkn->nk", mean, modes.shapes), self.corners), known
 
     def in_amplitudes(self, units: Tensor) -> Tensor:
         """(B,) amplitudes of the board's own modes, from the variables (B,) of `applied`."""
@@ -146,6 +154,7 @@ class MeasuredBoard:
         half: (B, B) upper part of their covariance: halfᵀ half.
         log_evidence: nats by which the data prefer a printed board over one that is exactly as ordered.
         observations: names of the observations that it was measured from.
+        corners: (N, 2) meters by which single corners are off their places beside the modes; None: no evidence of it.
 
     Raises:
         InputError: shapes or values that do not fit the board.
@@ -157,8 +166,12 @@ class MeasuredBoard:
     half: Tensor
     log_evidence: float
     observations: tuple[str, ...] = ()
+    corners: Tensor | None = None
 
     def __post_init__(self) -> None:
+        corners = self.corners
+        if corners is not None and not (corners.shape == (self.board.corners, 2) and bool(corners.isfinite().all())):
+            raise InputError(f"measured board: finite displacements of {self.board.corners} corners are needed, x and y")
         size = len(board_modes(self.board.points).unit)
         if self.amplitudes.shape != (size,) or self.half.shape != (size, size):
             raise InputError(f"measured board: {size} amplitudes and a root of {size} x {size} are needed")
@@ -177,12 +190,14 @@ class MeasuredBoard:
         if int(info):
             raise InputError(f"the measured board {self.name!r}: its covariance is singular")
         weight = torch.nn.functional.pad(rows.T, (0, 1))
-        return BoardPrior(Gaussian(numbered(BOARD_SLOT, len(self.amplitudes)), self.amplitudes, weight))
+        own = Gaussian(numbered(BOARD_SLOT, len(self.amplitudes)), self.amplitudes, weight)
+        return BoardPrior(own, corners=self.corners)
 
     @property
     def points(self) -> Tensor:
         """(N, 3) the corners as they are, meters."""
-        return self.board.points + torch.einsum("b,bkn->nk", self.amplitudes, board_modes(self.board.points).shapes)
+        shapes = board_modes(self.board.points).shapes
+        return off_by(self.board.points + torch.einsum("b,bkn->nk", self.amplitudes, shapes), self.corners)
 
     @property
     def points_covariance(self) -> Tensor:
@@ -209,6 +224,11 @@ class MeasuredBoard:
         return self._measured(2.0 * self._fitted()[0][:, -1])
 
     @property
+    def corner_error(self) -> float:
+        """RMS distance, in the plane, of single corners from where the modes have them, meters."""
+        return 0.0 if self.corners is None else float(self.corners.square().sum(1).mean().sqrt())
+
+    @property
     def print_error(self) -> Measured:
         """RMS distance of the corners, in the plane, from the best stretched and sheared board, meters."""
         rows = self._fitted()[1][:, :2].flatten(1) / math.sqrt(self.board.corners)
@@ -222,14 +242,16 @@ class MeasuredBoard:
         """(M, 3) how far places of the board lie from where they were ordered, at the best shift, turn and scale.
 
         Args:
-            places: (M, 3) of the ordered board, meters, z = 0; the corners if not given.
+            places: (M, 3) of the ordered board, meters, z = 0, between the corners; the corners themselves if not
+                given, with what displaces single ones.
         """
         coefficients, rest = self._fitted(places)
         points = self.board.points if places is None else places
         x, y = (points[:, :2] - self.board.points[:, :2].mean(0)).unbind(-1)
         stretch, shear = (self.amplitudes @ coefficients[:, -2:]).tolist()
         plane = torch.stack([stretch * x + shear * y, shear * x - stretch * y, torch.zeros_like(x)])
-        return (torch.einsum("b,bkn->kn", self.amplitudes, rest) + plane).T
+        smooth = (torch.einsum("b,bkn->kn", self.amplitudes, rest) + plane).T
+        return off_by(smooth, self.corners if places is None else None)
 
     def _measured(self, row: Tensor) -> Measured:
         return Measured(float(self.amplitudes @ row), float((self.half @ row).norm()))
@@ -261,6 +283,7 @@ class BoardFile(NativeFile):
         half: rows of a matrix whose transpose times itself is their covariance.
         log_evidence: nats by which the data prefer this board over the ordered one.
         observations: names of the observations that it was measured from.
+        corners: meters in x and y by which each corner is off its place beside the modes.
     """
 
     KIND: ClassVar[str] = "board"
@@ -272,6 +295,7 @@ class BoardFile(NativeFile):
     half: tuple[tuple[float, ...], ...]
     log_evidence: float
     observations: tuple[str, ...] = ()
+    corners: tuple[tuple[float, float], ...] | None = None
 
     @pydantic.model_validator(mode="after")
     def _fits(self) -> BoardFile:
@@ -289,6 +313,7 @@ class BoardFile(NativeFile):
             half=torch.tensor(self.half, dtype=torch.float64),
             log_evidence=self.log_evidence,
             observations=self.observations,
+            corners=None if self.corners is None else torch.tensor(self.corners, dtype=torch.float64),
         )
 
 
@@ -316,6 +341,7 @@ def save_measured_board(board: MeasuredBoard, path: str | Path) -> Path:
         half=tuple(map(tuple, board.half.tolist())),
         log_evidence=board.log_evidence,
         observations=board.observations,
+        corners=None if board.corners is None else tuple((x, y) for x, y in board.corners.tolist()),
     ).save(path)
 
 

@@ -30,7 +30,7 @@ from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
 from kcal.calibrate.rig.pairs import Pair, evenly, paired_boards, pose_alone
 from kcal.calibrate.rig.result import Reasons, RigResult, records
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.unknowns import SharedUnknowns, free, gathered, held, joint_unknowns, less
+from kcal.calibrate.rig.unknowns import SharedUnknowns, deviation_of, free, gathered, held, joint_unknowns, less
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.finding import Finding
@@ -155,16 +155,21 @@ def without_repeated(
     free = [i for i, slot in enumerate(known.slots) if slot >= 0]
     with_board = known.board_size > 0
     # Unknowns of the calibration: of the camera, and of the board as it was ordered.
+    shapes = board_modes(boards.board.points).shapes if with_board else pixels.new_zeros(0, 3, pixels.shape[1])
+    amplitudes, points = known.estimate[known.lens_size :], boards.points
+    if with_board:
+        # Single corners may be off their places beside the modes.
+        smooth = torch.einsum("b,bcn->nc", amplitudes, shapes)
+        points = boards.board.points + deviation_of(camera, boards.board, smooth) - smooth
     problem = BoardProblem(
-        boards.board.points if with_board else boards.points,
+        points,
         pixels,
         camera.model,
         FreeParameters(tuple(free), tuple(known.slots[i] for i in free)),
-        shapes=board_modes(boards.board.points).shapes if with_board else pixels.new_zeros(0, 3, pixels.shape[1]),
+        shapes=shapes,
         free_board=with_board,
         weights=boards.whitening(sigma)[at],
     )
-    amplitudes = known.estimate[known.lens_size :]
     seen = problem.board_points + torch.einsum("b,bcn->nc", amplitudes, problem.shapes)
     poses, _ = pose_alone(seen, pixels, camera, solver)
     state = BoardState.still(parameters, amplitudes, poses.rotation, poses.translation)

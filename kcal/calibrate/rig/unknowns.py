@@ -301,7 +301,25 @@ def joint_unknowns(
         known=torch.cat([(turn[known] != 0).any(0) for turn, known in zip(turns, parts_known, strict=True)]),
         labels=("",) * sum(turn.shape[1] for turn in turns),
     )
-    return found, None if modes is None else torch.einsum("b,bcn->nc", amplitudes, shapes)
+    if modes is None:
+        return found, None
+    smooth = torch.einsum("b,bcn->nc", amplitudes, shapes)
+    first = next((camera for camera, part in zip(cameras, parts, strict=True) if part and part.board_size), None)
+    return found, smooth if first is None or board is None else deviation_of(first, board, smooth)
+
+
+def deviation_of(camera: Camera, board: Board, smooth: Tensor) -> Tensor:
+    """(N, 3) meters by which a camera's calibration found its board off the order, single corners included.
+
+    Args:
+        camera: the camera.
+        board: of the rig; of another one nothing is known beside the modes.
+        smooth: (N, 3) the same without single corners, from the modes of its board.
+    """
+    record = None if camera.calibration is None else camera.calibration.record
+    if record is None or record.board_deviation is None or record.board != board.record:
+        return smooth
+    return torch.tensor(record.board_deviation, dtype=torch.float64)
 
 
 class _GivenBoard(NamedTuple):
