@@ -69,7 +69,7 @@ def test_a_camera_is_found_with_each(kind: str) -> None:
     assert found.sigma == pytest.approx(NOISE, rel=0.12)
     # Only Zernike fields know that lenses are round: others leave more between field, focal length and pupil.
     assert off(found.camera) < (2.5 if kind == "zernike" else 6.0) * NOISE
-    assert len(found.hyperparameters) == len(KINDS[kind].hyperprior) + 5
+    assert len(found.hyperparameters) == len(KINDS[kind].hyperprior) + 6
     assert 8 < found.effective < 80
 
 

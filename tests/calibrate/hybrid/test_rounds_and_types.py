@@ -112,11 +112,11 @@ def test_evidence_of_a_printed_board_against_one_as_ordered() -> None:
     sigma = torch.tensor([2e-5, 3e-5, 1e-5], dtype=torch.float64)
     messages = [Gaussian.independent(slots, m, s.expand(28)) for m, s in zip(mean, sigma, strict=True)]
     cameras = [
-        cast(CameraFit, SimpleNamespace(board=k, message=message, fit=SimpleNamespace(board_shapes=modes)))
+        cast(CameraFit, SimpleNamespace(board=k, message=message, turns=torch.zeros(2), fit=SimpleNamespace(board_shapes=modes, displaced=None)))
         for k, message in zip((0, 1, 0), messages, strict=True)
     ]
     sets = cast(Any, [SimpleNamespace(board=BOARD)] * 3)
-    found = _measured(0, sets, ["left", "right", "middle"], cameras)
+    found = _measured(0, sets, ["left", "right", "middle"], cameras, [torch.zeros(2)] * 3)
     assert (found.name, found.observations, found.board) == ("left", ("left", "middle"), BOARD)
     prior, evidence = printed_board(modes, [messages[0], messages[2]])
     as_ordered = -0.5 * float(sum((mean[k] / sigma[k]).square().sum() for k in (0, 2)))
