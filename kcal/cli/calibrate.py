@@ -79,8 +79,11 @@ def told_calibration(result: CameraCalibrationResult, beside: Path, *, reject: b
             f"stretch {measured_text(100 * wide, 100 * wide_s, '%', sign=True)}, "
             f"shear {measured_text(100 * skew, 100 * skew_s, '%', sign=True)}, "
             f"print {measured_text(1e3 * rest, 1e3 * rest_s, 'mm')}"
-            + (f"; single corners are off by {number_text(1e3 * board.corner_error, digits=2)} mm (RMS) beside this"
-            if board.corner_error else "")
+            + (
+                f"; single corners are off by {number_text(1e3 * board.corner_error, digits=2)} mm (RMS) beside this"
+                if board.corner_error
+                else ""
+            )
         )
     if verbose:
         print_table([["parameter", "value", "± σ"], *_parameters(result)])

@@ -45,7 +45,7 @@ from kcal.report.figures import (
     round_levels,
     shortened,
 )
-from kcal.texts import measured_text, percent_text
+from kcal.texts import measured_text, number_text, percent_text
 from kcal.threads import in_one_thread
 
 # Draw a calibration: where the board was seen, the residuals, and the RMS of each view.

@@ -2,13 +2,13 @@
 
     python -m scripts.check.board_corners --out FILE --seeds 0-99              # simulated boards
     KCAL_DATA=DATA python -m scripts.check.board_corners --out FILE --real     # captures by two cameras of one board
-    python -m scripts.check.board_corners --out FILE --write                   # the tables of docs/measured/one-camera.md
+    python -m scripts.check.board_corners --out FILE --write                   # the tables of one-camera.md
 
 Simulated: the traced lenses of `scripts.shared.simulated`, on a stand, 0.08 px of noise. Boards are exact, printed
-(`PrintedBoard`), or printed with each corner off by 0.03 mm in x and y (standard deviation). *Smooth*: without the term
-for single corners. Real: a camera is fitted to the first half of its views with a board of which nothing is known
-but its smooth modes (*smooth*), with single corners of its own (*default*), and with the corners that the **other** camera
-found in its own views, held (*other's*). The other half is then predicted: poses are refitted, board and camera are held.
+(`PrintedBoard`), or printed with each corner off by 0.03 mm in x and y (standard deviation). *Smooth*: without the
+term for single corners. Real: a camera is fitted to either half of its views with a board of smooth errors alone
+(*smooth*), with single corners of its own (*default*), and with the corners that the **other** camera found in its own
+views, held (*other's*). The other half is then predicted: poses are refitted, board and camera are held.
 """
 
 from __future__ import annotations
@@ -156,7 +156,9 @@ def line(record: Record) -> str:
     """One line to print."""
     if "rms" in record:
         return str(record)
-    told = [f"{name} {one.get('rms', math.nan):.3f} {one.get('terms')}" for name, one in record.items() if name != "key"]
+    told = [
+        f"{name} {one.get('rms', math.nan):.3f} {one.get('terms')}" for name, one in record.items() if name != "key"
+    ]
     return ", ".join(told)
 
 
@@ -167,7 +169,9 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", choices=("exact", "printed", "corners"), default=["exact", "corners"])
     parser.add_argument("--views", nargs="+", type=int, default=VIEWS)
     parser.add_argument("--real", action="store_true", help="the pairs of cameras in KCAL_DATA")
-    parser.add_argument("--cache", type=Path, default=Path("/tmp/kcal-ordinary-corners"), help="corners found in images")
+    parser.add_argument(
+        "--cache", type=Path, default=Path("/tmp/kcal-ordinary-corners"), help="corners found in images"
+    )
     parser.add_argument("--write", action="store_true", help="write the tables into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)

@@ -78,9 +78,14 @@ class PriorFamilies(NamedTuple):
             modes: amplitudes of the board that these priors are of.
             hyper: number of the hyperparameters.
         """
-        family, zero = torch.where(board.family == KNOWN, -1, hyper + BOARD + board.family), torch.zeros_like(board.unit)
+        family, zero = (
+            torch.where(board.family == KNOWN, -1, hyper + BOARD + board.family),
+            torch.zeros_like(board.unit),
+        )
         own = (zero, board.unit.log(), family, torch.full_like(family, -1), zero)
-        return PriorFamilies(*(torch.cat([part[: len(part) - modes], new]) for part, new in zip(self, own, strict=True)))
+        return PriorFamilies(
+            *(torch.cat([part[: len(part) - modes], new]) for part, new in zip(self, own, strict=True))
+        )
 
     def deviation(self, h: Tensor) -> Tensor:
         """(..., S) prior standard deviations, of hyperparameters (..., H)."""

@@ -404,7 +404,16 @@ class HybridFit:
         """The least-squares problem of this lens, board and motion, for given data and priors; see `hybrid_problem`."""
         shapes = self.board_shapes.shapes
         return hybrid_problem(
-            off_by(points, self.displaced), shapes, pixels, weights, self.model, mean, precision, self.readout, self.own_stillness, self.square
+            off_by(points, self.displaced),
+            shapes,
+            pixels,
+            weights,
+            self.model,
+            mean,
+            precision,
+            self.readout,
+            self.own_stillness,
+            self.square,
         )
 
     def residuals_of(self, pixels: Tensor) -> Tensor:

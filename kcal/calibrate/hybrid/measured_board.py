@@ -171,7 +171,9 @@ class MeasuredBoard:
     def __post_init__(self) -> None:
         corners = self.corners
         if corners is not None and not (corners.shape == (self.board.corners, 2) and bool(corners.isfinite().all())):
-            raise InputError(f"measured board: finite displacements of {self.board.corners} corners are needed, x and y")
+            raise InputError(
+                f"measured board: finite displacements of {self.board.corners} corners are needed, x and y"
+            )
         size = len(board_modes(self.board.points).unit)
         if self.amplitudes.shape != (size,) or self.half.shape != (size, size):
             raise InputError(f"measured board: {size} amplitudes and a root of {size} x {size} are needed")

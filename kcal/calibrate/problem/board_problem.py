@@ -290,8 +290,8 @@ class BoardProblem(SchurProblem[BoardState]):
             amplitudes = state.board[..., : len(self.shapes)]
             flat = flat + torch.einsum("...b,vbkn->...vkn", amplitudes, _of_views(self._shapes, views))
         if self.displaced:
-            moved = state.board[len(self.shapes) :].view(2, -1)
-            flat = flat + _of_views(self._of_board(torch.nn.functional.pad(moved, (0, 0, 0, 1))), views)
+            off = torch.nn.functional.pad(state.board[len(self.shapes) :].view(2, -1), (0, 0, 0, 1))
+            flat = flat + _of_views(self._of_board(off), views)
         if self.readout is None:
             rotated = state.rotation @ flat
             return _Placed(flat, rotated, rotated + state.translation[..., None], None)
@@ -389,9 +389,7 @@ class BoardProblem(SchurProblem[BoardState]):
         numbers = self._numbers.view(len(values), *[1] * (values.ndim - 2), -1).expand_as(values)
         return values.new_zeros(*values.shape[:-1], self.board_points.shape[-2]).scatter(-1, numbers, values)
 
-    def _own_rows(
-        self, state: BoardState, views: slice, memory: list[Tensor] | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def _own_rows(self, state: BoardState, views: slice, memory: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Rows (..., V, L + S + 1, 2, K) without displacements of the corners; derivatives (V, 2, 2, K) by these."""
         placed, seen, rotation, _ = self._imaged(state, views)
         error = seen.pixels - self._target[..., views, :, :]
@@ -640,7 +638,7 @@ class BoardProblem(SchurProblem[BoardState]):
         return torch.cat([without_local(self.rows(state, views), self.local_size) for views in self._chunks(state)])
 
     def reduced_rows(self, state: BoardState) -> Tensor:
-        """(S + 1, S + 1) rows with the same products as those of `off_poses`, some views at a time; as a rule a triangle."""
+        """(S + 1, S + 1) rows with the same products as those of `off_poses`, as a rule a triangle."""
         if self.displaced:
             # Of hundreds of unknowns more, to the precision of products.
             total = self._with_motion(state).off(self.local_size).total

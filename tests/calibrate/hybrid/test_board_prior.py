@@ -69,7 +69,9 @@ def test_amplitudes_of_largest_evidence() -> None:
     prior, value = printed_board(MODES, [message])
     typical = typical_hyperprior()
     mean, sd = typical.mean[BOARD:], typical.sd[BOARD:]
-    h = torch.stack([(1.0 / prior.rows.diagonal() / MODES.unit)[MODES.family == k][0].log() for k in range(4)] + [mean[4]])
+    h = torch.stack(
+        [(1.0 / prior.rows.diagonal() / MODES.unit)[MODES.family == k][0].log() for k in range(4)] + [mean[4]]
+    )
 
     def at(h: Tensor) -> float:
         hyper = 0.5 * float(((h - mean) / sd).square().sum())
@@ -198,9 +200,13 @@ def said(result: CameraCalibrationResult) -> list[str]:
 
 @pytest.mark.parametrize(
     ("name", "wanted"),
-    [("stand", []), ("bent", ["bending"]), ("few", ["bending"]), ("both", ["motion", "bending"]), ("hand", ["motion"])],
-)
+    [
+        ("stand", []), ("bent", ["bending"]), ("few", ["bending"]), ("both", ["motion", "bending", "corners"]),
+        ("hand", ["motion", "corners"]),
+    ],
+)  # fmt: skip
 def test_what_views_do_is_told_by_the_evidence(name: str, wanted: list[str]) -> None:
+    """Errors of 0.02 mm that the print of the board by hand has beside its modes are found, too."""
     fit = found(name).hybrid
     assert terms(fit) == wanted
     assert len(said(found(name))) == ("bending" in wanted)
@@ -252,9 +258,10 @@ def real(name: str) -> Observations:
 @pytest.mark.parametrize(
     ("name", "wanted", "noise"),
     [
-        ("camodocal", ["motion", "bending", "corners"], 0.034), ("carnd18", ["bending", "corners"], 0.26),
+        ("camodocal", ["motion", "bending", "corners"], 0.034),
+        ("carnd18", ["bending", "corners"], 0.26),
         ("st1_r", ["motion", "corners"], 0.047),
-    ],  # fmt: skip
+    ],
 )
 def test_captures_of_strangers(name: str, wanted: list[str], noise: float) -> None:
     """Boards that bend, of a car's fisheye and on a wall: no second camera is blamed for it, nor a shutter alone."""

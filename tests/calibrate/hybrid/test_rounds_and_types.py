@@ -112,7 +112,12 @@ def test_evidence_of_a_printed_board_against_one_as_ordered() -> None:
     sigma = torch.tensor([2e-5, 3e-5, 1e-5], dtype=torch.float64)
     messages = [Gaussian.independent(slots, m, s.expand(28)) for m, s in zip(mean, sigma, strict=True)]
     cameras = [
-        cast(CameraFit, SimpleNamespace(board=k, message=message, turns=torch.zeros(2), fit=SimpleNamespace(board_shapes=modes, displaced=None)))
+        cast(
+            CameraFit,
+            SimpleNamespace(
+                board=k, message=message, turns=torch.zeros(2), fit=SimpleNamespace(board_shapes=modes, displaced=None)
+            ),
+        )
         for k, message in zip((0, 1, 0), messages, strict=True)
     ]
     sets = cast(Any, [SimpleNamespace(board=BOARD)] * 3)
