@@ -4,7 +4,7 @@
     KCAL_DATA=DATA python -m scripts.check.board_corners --out FILE --real     # captures by two cameras of one board
     python -m scripts.check.board_corners --out FILE --write                   # the tables of one-camera.md
 
-Simulated: the traced lenses of `scripts.shared.simulated`, on a stand, 0.08 px of noise. Boards are exact, printed
+Simulated: the traced lenses of `scripts.shared.simulated`, on a stand. Boards are exact, printed
 (`PrintedBoard`), or printed with each corner off by 0.03 mm in x and y (standard deviation). *Smooth*: without the
 term for single corners. Real: a camera is fitted to either half of its views with a board of smooth errors alone
 (*smooth*), with single corners of its own (*default*), and with the corners that the **other** camera found in its own
@@ -36,7 +36,7 @@ from scripts.shared.real_captures import data_folder, load
 from scripts.shared.records import Record, finish, read, seeds
 from scripts.shared.simulated import BOARD, against_truth, simulated
 
-PAGE, SIGMA, OFF, VIEWS = "one-camera.md", 0.08, 3e-5, (8, 30)
+PAGE, NOISES, OFF, VIEWS = "one-camera.md", (0.03, 0.08), 3e-5, (8, 30)
 SIZE = BOARD.columns, BOARD.rows, BOARD.square
 PAIRS = (("st1_l", "st1_r"), ("gavin_l", "gavin_r"), ("stereo_left", "stereo_right"))
 
@@ -63,9 +63,9 @@ def board_of(kind: str, seed: int) -> BoardLike:
     return (SpeckledBoard if kind == "corners" else PrintedBoard)(*SIZE, seed)
 
 
-def simulation(kind: str, views: int, seed: int) -> Record:
+def simulation(kind: str, noise: float, views: int, seed: int) -> Record:
     """One capture, calibrated with and without the term."""
-    case, found = simulated(seed, views, SIGMA, False, board=board_of(kind, seed)), {}
+    case, found = simulated(seed, views, noise, False, board=board_of(kind, seed)), {}
     for name, options in (("default", CalibrationOptions()), ("smooth", _Smooth())):
         start = time.process_time()
         found[name] = against_truth(case, options) | {"cpu_s": time.process_time() - start}
@@ -116,21 +116,21 @@ def real(name: str, other: str, cache: Path) -> Record:
 
 def simulated_lines(records: list[Record]) -> list[str]:
     """A row for each kind of board, number of views and fit."""
-    rows, cells = [], dict[tuple[str, int], list[Record]]()
+    rows, cells = [], dict[tuple[str, float, int], list[Record]]()
     for record in records:
-        cells.setdefault((record["key"][0], record["key"][1]), []).append(record)
-    for (kind, views), own in sorted(cells.items(), key=lambda cell: (cell[0][1], cell[0][0])):
+        cells.setdefault(tuple(record["key"][:3]), []).append(record)
+    for (kind, noise, views), own in sorted(cells.items(), key=lambda cell: cell[0][::-1]):
         for fit in ("smooth", "default"):
             known = [record[fit] for record in own if "refused" not in record[fit]]
             found = statistics.fmean("corners" in record["terms"] for record in known)
             true, stated = [record["rms"] for record in known], [record["predicted"] for record in known]
             rows.append([
-                views, kind, fit, len(own), f"{100 * found:.0f} %" if fit == "default" else "–",
+                views, noise, kind, fit, len(own), f"{100 * found:.0f} %" if fit == "default" else "–",
                 share(known, "everywhere"), f"{statistics.median(true):.3f}", f"{rms(true):.3f}", f"{rms(stated):.3f}",
                 f"{statistics.fmean(record['cpu_s'] for record in known):.2f}",
             ])  # fmt: skip
     head = [
-        "views", "board", "fit", "captures", "found", "in 95 %, whole image", "median error, px", "RMS error",
+        "views", "noise, px", "board", "fit", "captures", "found", "in 95 %, whole image", "median error, px", "RMS error",
         "RMS stated", "CPU s",
     ]  # fmt: skip
     return table(head, rows)
@@ -168,6 +168,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=seeds, help="for example 0-99")
     parser.add_argument("--kinds", nargs="+", choices=("exact", "printed", "corners"), default=["exact", "corners"])
     parser.add_argument("--views", nargs="+", type=int, default=VIEWS)
+    parser.add_argument("--noises", nargs="+", type=float, default=NOISES, help="pixels")
     parser.add_argument("--real", action="store_true", help="the pairs of cameras in KCAL_DATA")
     parser.add_argument(
         "--cache", type=Path, default=Path("/tmp/kcal-ordinary-corners"), help="corners found in images"
@@ -176,8 +177,8 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.seeds is not None:
-        keys = [*itertools.product(arguments.kinds, arguments.views, arguments.seeds)]
-        finish(arguments.out[0], sorted(keys, key=lambda key: key[2]), simulation, line)
+        keys = [*itertools.product(arguments.kinds, arguments.noises, arguments.views, arguments.seeds)]
+        finish(arguments.out[0], sorted(keys, key=lambda key: key[3]), simulation, line)
     if arguments.real:
         keys = [("real", *names) for pair in PAIRS for names in (pair, pair[::-1])]
         finish(arguments.out[0], keys, lambda _, *names: real(*names, arguments.cache), line)
