@@ -14,7 +14,6 @@ from torch import Tensor
 
 from kcal import Board, Camera, InputError, Observations, load_camera
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.board_modes import board_modes, turned_corner_offsets, turned_corners
 from kcal.calibrate.hybrid.cameras_fit import CamerasFit, fit_cameras
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
@@ -46,14 +45,9 @@ def seen(seed: int, off: Tensor | None, views: int = 12) -> Observations:
 
 
 @functools.cache
-def result(planted: bool) -> CameraCalibrationResult:
-    return calibrate_camera(seen(1, PLANTED if planted else None))
-
-
-def fit(planted: bool) -> HybridFit:
-    found = result(planted).hybrid
-    assert found is not None
-    return found
+def fit(planted: bool, corners: bool = True) -> HybridFit:
+    options = FitOptions(modes=MODES, corners=corners, motion=False, bending=False)
+    return fit_hybrid(BOARD.points, seen(1, PLANTED if planted else None).pixels(), SIZE, options=options)
 
 
 def beside(off: Tensor) -> Tensor:
@@ -112,18 +106,14 @@ def test_found_where_they_are_and_only_there() -> None:
     assert fit(False).displaced is None
     assert agreement(fit(True).displaced, PLANTED) > 0.9
     assert fit(True).sigma == pytest.approx(NOISE, rel=0.1)
-    smooth = fit_hybrid(
-        BOARD.points, seen(1, PLANTED).pixels(), SIZE, options=FitOptions(modes=MODES, corners=False)
-    )  # fmt: skip
+    smooth = fit(True, corners=False)
     assert smooth.displaced is None
     assert smooth.sigma > 1.5 * NOISE
     assert fit(True).log_evidence > smooth.log_evidence + 100.0
-    assert result(True).measured_board is not None
-    assert result(True).measured_board.corner_error == pytest.approx(OFF * math.sqrt(2.0), rel=0.3)
 
 
 def test_an_exact_board_has_none() -> None:
-    options = FitOptions(modes=MODES, board="exact")
+    options = FitOptions(modes=MODES, board="exact", motion=False)
     assert fit_hybrid(BOARD.points, seen(1, PLANTED).pixels(), SIZE, options=options).displaced is None
 
 
@@ -165,6 +155,7 @@ def shared() -> CamerasFit:
     return fit_cameras([observe(one, board=BOARD, size=SIZE) for one in pixels], modes=MODES)
 
 
+@pytest.mark.slow
 def test_cameras_tell_each_other_of_them(tmp_path: Path) -> None:
     """Also where one of them read its views from another end; a board file keeps them."""
     found = shared()
@@ -183,6 +174,7 @@ def test_cameras_tell_each_other_of_them(tmp_path: Path) -> None:
     torch.testing.assert_close(board.displacements(), off_by(smooth, board.corners))
 
 
+@pytest.mark.slow
 def test_a_measured_board_brings_them() -> None:
     """A camera with five views of it, too few to find much of them, has them all."""
     (board,) = shared().boards
@@ -193,9 +185,12 @@ def test_a_measured_board_brings_them() -> None:
     assert own.sigma < 1.2 * NOISE
 
 
+@pytest.mark.slow
 def test_a_rig_does_not_count_views_twice(tmp_path: Path) -> None:
     """Its boards are read as the calibration has them: with single corners, or residuals would not be the same."""
-    found = result(True)
+    found = calibrate_camera(seen(1, PLANTED))
+    assert found.measured_board is not None
+    assert found.measured_board.corner_error == pytest.approx(OFF * math.sqrt(2.0), rel=0.3)
     views = found.observations
     boards = Boards(board=BOARD, pixels=views.pixels()[:, None], names=views.names, views=(views.names,))
     left = without_repeated(
