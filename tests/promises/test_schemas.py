@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from kcal import Observations, load_camera, load_rig, save_camera, save_rig
+from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
 from kcal.cli.exchange import FILES, file_schema
 from kcal.cli.main import app
 
@@ -33,6 +34,8 @@ def content(kind: str, folder: Path) -> dict[str, Any]:
         path = save_rig(load_rig(path), folder / "rig.json")
     elif kind == "observations":
         path = Observations.load(path).save(folder / "seen.json")
+    else:
+        path = save_measured_board(load_measured_board(path), folder / "board.json")
     return json.loads(path.read_text(encoding="utf-8"))
 
 
