@@ -258,13 +258,13 @@ class TestGeneral:
 
     @pytest.mark.parametrize(("stated", "misprint", "said"), [(0.015, 0.6, True), (0.02, 0.0, False)])
     def test_noise_far_above_that_of_corners(self, stated: float, misprint: float, said: bool) -> None:
-        """A board of which each corner is elsewhere than was ordered: it is small in each view, and no noise."""
+        """A plate, as is said, of which each corner is elsewhere: it is small in each view, and no noise."""
         truth, generator = camera("pinhole"), torch.Generator().manual_seed(4)
         pixels = pixels_of(truth, motions(truth, 10, 2), noise=0.08)
         seen = observe(pixels + misprint * torch.randn(BOARD.corners, 2, dtype=torch.float64, generator=generator))
         spread = ((stated**2, 0.0, stated**2),) * BOARD.corners
         views = tuple(view.model_copy(update={"covariance": spread}) for view in seen.views)
-        found = calibrate_camera(seen.model_copy(update={"views": views}))
+        found = calibrate_camera(seen.model_copy(update={"views": views}), CalibrationOptions(board="exact"))
         assert 0.08 < found.rms < 1.0
         warned = [text for text in found.warnings if "corners' own covariances" in text]
         assert len(warned) == said
