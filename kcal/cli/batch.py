@@ -71,7 +71,7 @@ def batch_command(
     if given is None:
         for job in jobs:
             if job.board is not None:
-                out.print(f"{job.name}: board {job.board}", markup=False)
+                out.print(f"{job.name}: board {job.board}")
     options = BatchOptions(refine=refine.value, board_warp=board_warp, one_type=one_type, time_limit=time_limit)
     try:
         with steps("images and cameras", pieces(jobs)) as advance:
@@ -81,7 +81,7 @@ def batch_command(
         raise typer.Exit(130) from None
     heads = ["camera", "views", "RMS px", "focal px", "± σ", "cx", "cy", "model", "note"]
     print_table([heads, *map(_cells, report.rows)], left=(0, 7, 8))
-    out.print(f"{report.reused} of {report.total} pieces of work were there already", markup=False)
+    out.print(f"{report.reused} of {report.total} pieces of work were there already")
     print_wrote(report.summary)
     failed = [row.camera for row in report.rows if row.error]
     if failed:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import typer
-from rich.markup import escape
 
 import kcal
 from kcal.cli import kinds
@@ -15,6 +14,7 @@ from kcal.cli.console import (
     ending_with,
     out,
     print_left_out,
+    print_styled,
     print_table,
     print_wrote,
     steps,
@@ -56,7 +56,7 @@ def told_calibration(result: CameraCalibrationResult, beside: Path, *, reject: b
     # Warnings explain the others.
     ended = "converged" if result.status.name == "CONVERGED" else result.status.message
     fitted = f"; noise {result.noise:.4f} px along an axis; {ended} ({result.iterations} steps)"
-    out.print(f"RMS [bold]{result.rms:.4f} px[/]{fitted}")
+    print_styled(f"RMS {result.rms:.4f} px{fitted}", r"(?<=^RMS )\S+ px")
     brief = summarize(result)
     if brief.worst == brief.worst:
         center, border, worst = (number_text(one, digits=2) for one in (brief.center, brief.border, brief.worst))
@@ -96,7 +96,7 @@ def told_calibration(result: CameraCalibrationResult, beside: Path, *, reject: b
     print_left_out(lines, beside, f"{len(lines)} views and corners were left out")
     warn(*result.warnings)
     for text in result.advice:
-        out.print(f"next: {text}", markup=False)
+        out.print(f"next: {text}")
     return dict(
         rms_px=result.rms,
         noise_px=result.noise,
@@ -294,7 +294,7 @@ def calibrate_command(
     figures: dict[str, dict[str, Any]] = {}
     for place, result in zip(places, outcomes, strict=True):
         if len(places) > 1:
-            out.print(f"[bold]{escape(place.name)}[/]")
+            print_styled(place.name, ".*")
         if isinstance(result, KcalError):
             warn(f"{place.name}: {with_command(str(result), cure(result, places.index(place)))}")
             continue
@@ -310,7 +310,7 @@ def calibrate_command(
         )
         if result.shared_board is not None:
             others = ", ".join(places[i].name for i in result.shared_board.others)
-            out.print(f"the board is that of {others} (evidence {result.shared_board.evidence:.0f} nats)", markup=False)
+            out.print(f"the board is that of {others} (evidence {result.shared_board.evidence:.0f} nats)")
         print_wrote(place.output, place.picture)
         if needs or place.report is not None:
             found = judged(

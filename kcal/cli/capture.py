@@ -67,7 +67,7 @@ def capture_command(
     pattern = pattern or board_in_images([source], square)
     session = CaptureSession(output, pattern, CaptureOptions(until=until, most=most, refine=refine.value))
     if session.views:
-        err.print(f"{output} has {session.views} views; going on", markup=False)
+        err.print(f"{output} has {session.views} views; going on")
     stop = threading.Event()
     failed: list[KcalError] = []
 
@@ -76,9 +76,9 @@ def capture_command(
 
     def watch() -> None:
         try:
-            for shot in shots(source, over, lambda text: err.print(text, markup=False)):
+            for shot in shots(source, over, lambda text: err.print(text)):
                 if session.offer(shot.image, shot.name, moving=shot.moving):
-                    out.print(f"{session.views}: {shot.name}", markup=False)
+                    out.print(f"{session.views}: {shot.name}")
         except KcalError as error:
             failed.append(error)
         stop.set()
@@ -118,9 +118,9 @@ def capture_command(
         out.print(f"{session.views} views kept{known}")
     if not session.views:
         raise InputError(f"no frame showed the board: {session.message}")
-    out.print(f"wrote {output} and {session.views} frames in {session.frames}", markup=False)
+    out.print(f"wrote {output} and {session.views} frames in {session.frames}")
     camera = f"{output.name.split('.')[0]}.camera.json"
-    out.print(f"next: kcal calibrate {output} -o {output.with_name(camera)}", markup=False, soft_wrap=True)
+    out.print(f"next: kcal calibrate {output} -o {output.with_name(camera)}", soft_wrap=True)
 
 
 def _stop_server(threads: list[threading.Thread], server: LocalServer) -> None:
@@ -138,6 +138,6 @@ def _tell(session: CaptureSession, over: Callable[[], bool]) -> None:
         words = session.suggestion.words if session.suggestion is not None else session.message
         if words != said:
             known = f" (now ± {session.sigma:.3f} px)" if session.history else ""
-            out.print(f"next: the board {words}{known}", markup=False)
+            out.print(f"next: the board {words}{known}")
             said = words
         time.sleep(0.2)

@@ -123,7 +123,7 @@ def diff_command(
     cameras = [single_camera(source) for source in (first, second)]
     then, now = (_temperature(camera) for camera in cameras)
     for source, camera in zip((first, second), cameras, strict=True):
-        out.print(f"{source}: {_history(camera)}", markup=False)
+        out.print(f"{source}: {_history(camera)}")
     found = kcal.lens.camera_difference(*cameras, at=distance, rotation=None if turn else torch.eye(3))
     tell(
         at_m=None if math.isinf(distance) else distance,
@@ -136,9 +136,9 @@ def diff_command(
         temperature_c=[then, now],
     )
     if then is not None and now is not None and now != then:
-        out.print(f"{abs(now - then):g} °C {'warmer' if now > then else 'colder'}", markup=False)
+        out.print(f"{abs(now - then):g} °C {'warmer' if now > then else 'colder'}")
     for line in difference_text(found):
-        out.print(line, markup=False)
+        out.print(line)
     if picture is not None:
         from kcal.report.calibration import difference_figure
 
@@ -212,7 +212,7 @@ def interpolate_command(
         by = [f"{number_text(value, digits=2)} by {name}" for name, value in parts.items() if value]
         how, whence = "interpolated", f": {', '.join(by)}"
     known = f"points at infinity ± {number_text(total, digits=2)} px (median)"
-    out.print(f"{made}, {how}: {known}{whence}", markup=False)
+    out.print(f"{made}, {how}: {known}{whence}")
     tell(setting=wanted, sigma_px={"median": total, **parts})
     kcal.save_camera(found.camera, output, name=output.name.split(".")[0])
     print_wrote(output)

@@ -48,8 +48,20 @@ class _PlainConsole(Console):
             _line.start()
 
 
-out = _PlainConsole(soft_wrap=True, highlight=False, emoji=False)
-err = _PlainConsole(stderr=True, soft_wrap=True, highlight=False, emoji=False)
+out = _PlainConsole(soft_wrap=True, highlight=False, emoji=False, markup=False)
+err = _PlainConsole(stderr=True, soft_wrap=True, highlight=False, emoji=False, markup=False)
+
+
+def print_styled(text: str, part: str, style: str = "bold", *, to: Console = out) -> None:
+    """Print a text; what matches the regular expression `part` is in another style."""
+    shown = Text(visible(text))
+    shown.highlight_regex(part, style)
+    to.print(shown)
+
+
+def print_label(label: str, text: str, style: str = "yellow") -> None:
+    """Print to the error stream a text after a label: `warning`, `left out`, `error`."""
+    print_styled(f"{label}: {text}", f"^{label}:", style, to=err)
 
 
 # What the running command tells programs, if it was asked to.
@@ -87,7 +99,7 @@ def warn(*texts: str) -> None:
     """Print warnings to the error stream."""
     for text in texts:
         _tell_more("warnings", visible(text))
-        err.print("[yellow]warning:[/]", escape(text))
+        print_label("warning", text)
 
 
 def print_wrote(*paths: Path | None) -> None:
@@ -95,7 +107,7 @@ def print_wrote(*paths: Path | None) -> None:
     for path in paths:
         if path is not None:
             _tell_more("wrote", str(path))
-            out.print(f"{'replaced' if replaced(path) else 'wrote'} {path}", markup=False)
+            out.print(f"{'replaced' if replaced(path) else 'wrote'} {path}")
 
 
 def print_replaced(written: Mapping[Path, bool]) -> None:
@@ -104,7 +116,7 @@ def print_replaced(written: Mapping[Path, bool]) -> None:
     names = [str(path) for path, anew in written.items() if anew and str(path) not in said]
     if names:
         others = [f"{len(names) - 3} other files"] if len(names) > 3 else []
-        err.print(f"replaced {', '.join([*names[:3], *others])}", markup=False)
+        err.print(f"replaced {', '.join([*names[:3], *others])}")
 
 
 _MOST_LINES = 12  # of a list on the screen
@@ -114,7 +126,7 @@ def print_left_out(lines: Sequence[str], beside: Path, head: str) -> None:
     """Print what was left out, a line each; of more than a screen of them one line and the file with all of them."""
     if len(lines) <= _MOST_LINES:
         for line in lines:
-            out.print(f"  {line}", markup=False)
+            out.print(f"  {line}")
         return
     reasons = [line.partition(": ")[2] for line in lines]
     kinds = [re.sub(r"[\d.]+", "N", reason) for reason in reasons]
@@ -122,7 +134,7 @@ def print_left_out(lines: Sequence[str], beside: Path, head: str) -> None:
     path = beside.with_name(f"{beside.name.split('.')[0]}.left-out.txt")
     write_atomic(path, "".join(f"{line}\n" for line in lines))
     _tell_more("wrote", str(path))
-    out.print(f"{head}, {count} of them: {reasons[kinds.index(most)]}; all of them: {path}", markup=False)
+    out.print(f"{head}, {count} of them: {reasons[kinds.index(most)]}; all of them: {path}")
 
 
 def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> None:
@@ -134,7 +146,7 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
     """
     rows = [[one_line(cell) for cell in row] for row in rows]
     _tell_more("tables", rows)
-    out.print("\n".join(aligned(rows, left)), markup=False)
+    out.print("\n".join(aligned(rows, left)))
 
 
 def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
@@ -155,13 +167,13 @@ def tell_table(name: str, table: Table, left: Collection[int] = (0,)) -> None:
 
 def print_answer(yes: bool, text: str) -> None:
     """Print a yes or no, and why."""
-    out.print(f"[bold]{'YES' if yes else 'NO'}[/]: {escape(text)}")
+    print_styled(f"{'YES' if yes else 'NO'}: {text}", "^(YES|NO)")
 
 
 def show_page(address: str, what: str, *, browser: bool) -> None:
     """Print the address of a local page, and open it in the browser if that is wanted."""
     _line.stop()
-    out.print(f"{what}: {address}", markup=False, soft_wrap=True)
+    out.print(f"{what}: {address}", soft_wrap=True)
     if browser:
         import webbrowser
 

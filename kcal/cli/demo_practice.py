@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import kcal.sim.practice as practice
-from kcal.cli.console import err, out, steps, tell_table, warn
+from kcal.cli.console import err, out, print_styled, steps, tell_table, warn
 from kcal.errors import FileError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
 from kcal.io.camera_file import load_camera
@@ -146,15 +146,15 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
             except ImportError as error:
                 extra = _EXTRAS.get(error.name or "", "video")
                 cure = f"pip install 'kcal[{extra}]', and run this again"
-                err.print(f"{path} needs {error.name}, which is not installed: {cure}", markup=False)
+                err.print(f"{path} needs {error.name}, which is not installed: {cure}")
                 continue
             done += 1
             # Of a film each frame was told.
             advance(said, 0 if path.suffix == ".mp4" else work)
     kept = len(parts) - len(missing)
     text = f"; {kept} files were there already and are as they were" if kept else ""
-    out.print(f"wrote {done} files to {folder}{text}", markup=False)
-    out.print(f"Begin with:\n  cd {folder}\n  cat README.txt", markup=False)
+    out.print(f"wrote {done} files to {folder}{text}")
+    out.print(f"Begin with:\n  cd {folder}\n  cat README.txt")
 
 
 def check_folder(folder: Path, seed: int) -> None:
@@ -286,9 +286,9 @@ def practice_score(folder: Path) -> None:
     if step is None:
         out.print("All steps are done.")
         return
-    out.print(f"next: {step.name}, in {folder}:", markup=False)
+    out.print(f"next: {step.name}, in {folder}:")
     for command in step.commands:
-        out.print(f"  {command}", markup=False)
+        out.print(f"  {command}")
 
 
 def next_step(folder: Path) -> Exercise | None:
@@ -305,7 +305,7 @@ def next_step(folder: Path) -> Exercise | None:
 
 
 def _show(name: str, what: str, table: Table | None) -> None:
-    out.print(f"\n[bold]{what}[/]")
+    print_styled(f"\n{what}", ".+")
     if table is None or not table.rows:
         out.print("not done yet")
     else:
@@ -321,7 +321,7 @@ def _score_located(positions: Path | None, tracks: Path | None, truth: dict[str,
             inside = sum(row["contains"] for row in scores.records)
             out.print(f"{inside} of {len(scores.rows)} intervals contain the true range; 95 % are to be expected")
         if missing := [name for name in truth["targets"] if name.casefold() not in known]:
-            out.print(f"not among the positions: {', '.join(missing)} (names as in targets.csv)", markup=False)
+            out.print(f"not among the positions: {', '.join(missing)} (names as in targets.csv)")
     found, strays = (None, 0) if tracks is None else score_tracks(tracks, truth)
     _show("tracks", "Tracks: against the ships", found)
     if strays:

@@ -11,12 +11,11 @@ from pathlib import Path
 
 import torch
 import typer
-from rich.markup import escape
 from typer.main import get_command
 
 from kcal.calibrate.rig.pairs import pair_by_name
 from kcal.cli.calibrate import calibrate_command
-from kcal.cli.console import err, out, print_table, steps
+from kcal.cli.console import out, print_label, print_styled, print_table, steps
 from kcal.cli.detect import detect_command
 from kcal.cli.locate import locate_command
 from kcal.cli.options import Command, declared
@@ -188,7 +187,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
 def run(name: str, *arguments: object) -> None:
     """Print a command as a user would type it, and run it, without what kcal.toml says."""
     words = [str(argument) for argument in arguments]
-    out.print(f"\n[bold]kcal {escape(shlex.join([name, *words]))}[/]")
+    print_styled(f"\nkcal {shlex.join([name, *words])}", ".+")
     app = typer.Typer()
     app.command(cls=Command)(declared(_COMMANDS[name]))
     get_command(app).main(words, standalone_mode=False)
@@ -217,7 +216,7 @@ def locate_again(output: Path, *options: object) -> str:
 
 def print_results(output: Path, command: str) -> None:
     """Print where the results are, what they are, and the command that locates the points once more."""
-    out.print(f"\nResults are in {output.resolve()}:", markup=False)
+    out.print(f"\nResults are in {output.resolve()}:")
     for name, what in (
         ("summary.html", "what was done and what came out, on one page"),
         ("map.png", "the map"),
@@ -227,8 +226,8 @@ def print_results(output: Path, command: str) -> None:
         ("left.png, right.png", "coverage and residuals of each camera"),
         ("rig.json", "the rig; left.camera.json and right.camera.json are its cameras"),
     ):
-        out.print(f"  {name:22s} {what}", markup=False)
-    out.print(f"Locate again by hand:\n  {command}", markup=False)
+        out.print(f"  {name:22s} {what}")
+    out.print(f"Locate again by hand:\n  {command}")
 
 
 # `kcal demo --images`: the whole chain on a folder of real stereo pairs of a board.
@@ -250,12 +249,12 @@ def real_pairs(
     marks = read_marks(output / "points.csv")
     rig = load_pair(output / "rig.json")
     located = locate_points(Localizer(rig, origin=where, heading_deg=heading), marks)
-    out.print("\nThe board's diagonal, true against estimated", markup=False)
+    out.print("\nThe board's diagonal, true against estimated")
     rows = diagonal_rows(located, board)
     print_table(rows)
     save_pairs_summary(output, rows, command)
     if origin is None:
-        err.print("[yellow]note:[/] no --site was given: positions are placed at latitude 0, longitude 0")
+        print_label("note", "no --site was given: positions are placed at latitude 0, longitude 0")
     print_results(output, command)
 
 
@@ -336,14 +335,14 @@ def simulated_site(output: Path, seed: int) -> None:
     )
     lap("positions and maps")
     rows, chance = truth_rows(located, exact, targets.enu), chance_text(located, targets.enu)
-    out.print("\nTrue against estimated positions", markup=False)
+    out.print("\nTrue against estimated positions")
     print_table(rows)
     out.print(
         f"Marks have {scene.mark_sigma:g} px of noise in each image; the interval includes it and the errors of the "
         "rig. The last column is the error with marks that have no noise: the calibration's share."
     )
     chance += f" {_more_draws(scene, rig)}"
-    out.print(chance, markup=False)
+    out.print(chance)
     run("report", output / "rig.json", "--require", REQUIREMENT, "--pixel-sigma", scene.mark_sigma)
     save_site_summary(output, scene, rows, chance, command)
     times = [f"{name} {end - start:.1f} s" for (_, start), (name, end) in itertools.pairwise(laps.items())]

@@ -9,8 +9,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from rich.markup import escape
-
 import kcal
 from kcal.cli import kinds
 from kcal.cli.console import board_words, ending_with, err, out, print_left_out, steps, tell, warn
@@ -117,7 +115,7 @@ def detect_command(
     width, height = observations.image_size
     found, unseen = len(observations.views), sum(view.pixels.count(None) for view in observations.views)
     tell(views=found, failures={failure.name: failure.reason for failure in observations.failures})
-    out.print(f"{escape(str(output))}: board found in {found} {source} of {width}x{height} px")
+    out.print(f"{output}: board found in {found} {source} of {width}x{height} px")
     wide, high = (1e3 * side for side in pattern.extent)
     out.print(f"board {pattern}: {wide:g} x {high:g} mm from the first point to the last")
     warn(*notes)

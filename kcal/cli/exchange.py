@@ -66,10 +66,10 @@ def export_command(
     for camera, model_name, misfit in zip(names, done.models, done.misfits, strict=True):
         label = f"{camera or 'camera'}: {model_name}"
         if misfit is None:
-            out.print(f"{label}, {'baked' if done.format == 'remap' else 'exact'}", markup=False)
+            out.print(f"{label}, {'baked' if done.format == 'remap' else 'exact'}")
         else:
             text = f"{label}, fitted: RMS {misfit.rms:.2g} px, at most {misfit.largest:.2g} px over the image"
-            out.print(text, markup=False)
+            out.print(text)
             if misfit.rms > _FAR:
                 warn(
                     f"{camera or 'camera'}: no lens model of {done.format} comes nearer; mrcal files (.cameramodel) "
@@ -160,21 +160,20 @@ def _import_cameras(paths: list[Path], camera: str | None, output: Path, **state
     warn(*found.notes)
     if camera is None and len(found.poses) > 2 and not found.unread:
         kcal.save_rig(found.camera_rig(), output)
-        out.print(f"rig from {found.format}: {', '.join(found.names)}", markup=False)
+        out.print(f"rig from {found.format}: {', '.join(found.names)}")
     elif camera is None and found.is_rig() and not found.unread:
         rig = found.rig()
         kcal.save_rig(rig, output)
-        out.print(f"rig from {found.format}: baseline {float(rig.baseline):.6g} m", markup=False)
+        out.print(f"rig from {found.format}: baseline {float(rig.baseline):.6g} m")
     else:
         chosen = picked(found, camera, " ".join(map(str, paths)))
         kcal.save_camera(chosen, output)
-        out.print(f"camera from {found.format}: {chosen.model}, {chosen.size[0]}x{chosen.size[1]} px", markup=False)
+        out.print(f"camera from {found.format}: {chosen.model}, {chosen.size[0]}x{chosen.size[1]} px")
     known = [one.calibration is not None and one.calibration.covariance is not None for one in found.cameras]
     if without := [name for name, stated in zip(found.names, known, strict=True) if not stated]:
         out.print(
             f"no error bars in the file: {', '.join(without)}. A rig takes such a camera as exact, and no σ knows "
-            "the lens's errors",
-            markup=False,
+            "the lens's errors"
         )
 
 
@@ -246,4 +245,4 @@ def schema_command(kind: str | None = None) -> None:
     if kind not in FILES:
         raise InputError(f"kcal schema: no kind of file is called {kind!r}; kinds: {', '.join(FILES)}")
     tell(schema=file_schema(kind))
-    out.print(orjson.dumps(file_schema(kind), option=orjson.OPT_INDENT_2).decode(), markup=False)
+    out.print(orjson.dumps(file_schema(kind), option=orjson.OPT_INDENT_2).decode())

@@ -141,10 +141,10 @@ def live_command(
             with with_extra("mark", "--port needs"):
                 from kcal.pipeline.senders import LiveMap
             page = LiveMap(stream.run, port, start)
-            err.print(f"live map: {page.address}", markup=False)
+            err.print(f"live map: {page.address}")
         stream.shown = _progress(advance, stream, page)
         if stream.ledger.place.sequence:
-            err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}", markup=False)
+            err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}")
         ending = "finished"
 
         def stop(*_: object) -> None:
@@ -162,7 +162,7 @@ def live_command(
         finally:
             if page is not None:
                 page.close(ending)
-    err.print(summary(counts), markup=False)
+    err.print(summary(counts))
     if counts.jumps:
         ahead = "ahead" if counts.last_jump_s > 0 else "back"
         err.print(
@@ -170,17 +170,17 @@ def live_command(
             f"{abs(counts.last_jump_s):,.1f} s {ahead}"
         )
     if frames is not None:
-        err.print(str(frames.counts), markup=False)
+        err.print(str(frames.counts))
     if counts.malformed:
         if not (counts.moments or counts.repeated or counts.waiting or stream.ledger.place.sequence):
             raise InputError(f"none of {counts.malformed:,} lines could be read; the last one: {counts.last_error}")
-        err.print(f"last malformed line: {counts.last_error}", markup=False)
+        err.print(f"last malformed line: {counts.last_error}")
     if clock_sigma:
         for camera, name in enumerate(names[1:], 1):
             offset, sigma = stream.tracker.clock_estimate(camera).offset(stream.tracker.time)
             late = measured_text(1e3 * offset, 1e3 * sigma, "ms")
             whose = f"{name}'s" if many else f"the {name} camera's"
-            err.print(f"{whose} images are {late} later than their times say", markup=False)
+            err.print(f"{whose} images are {late} later than their times say")
 
 
 def summary(counts: StreamCounts) -> str:
@@ -232,7 +232,7 @@ def _videos(
         return tracker.clock_estimate(camera).offset(max(tracker.time, tracker.shared.start or 0.0))[0]
 
     def tell(text: str) -> None:
-        err.print(text, markup=False)
+        err.print(text)
 
     return Videos(videos, rig, load_detector(detector), options, late=late, match_sigma=match_sigma, tell=tell)
 

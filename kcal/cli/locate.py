@@ -50,14 +50,14 @@ def _print_positions(located: Located, true: Tensor | None, statuses: dict[str, 
     rows = position_rows(located, errors)
     shown: Sequence[int] = range(len(located.positions))
     if located.rows is not None:
-        out.print(counts_text(located.rows, statuses), markup=False)
+        out.print(counts_text(located.rows, statuses))
         shown = [] if true is None else true.isfinite().all(-1).nonzero()[:, 0].tolist()
-        out.print(f"Pictures and maps show {len(located.positions):,} of them.", markup=False)
+        out.print(f"Pictures and maps show {len(located.positions):,} of them.")
     if shown:
         print_table([rows[0], *(rows[i + 1] for i in shown)], left=(0, len(rows[0]) - 1))
     for position in (located.positions[i] for i in shown):
         if position.reason:
-            out.print(f"* {one_line(position.name)}: {position.reason}", markup=False)
+            out.print(f"* {one_line(position.name)}: {position.reason}")
     noise = "the noise that the CSV states" if stated else f"{located.pixel_sigma:g} px of noise"
     out.print(f"Interval: {located.interval_note}; marks have {noise}.")
     if located.origin is None:
@@ -205,7 +205,7 @@ def pair_localizer(solved: kcal.Rig, own: LocateOptions, noise: float) -> Callab
     if solved.mounting is not None and {"site", "heading"} <= taken:
         # What the rig was solved with is better known.
         site = heading = None
-        err.print(f"the position of the rig is that in its file, not that in {settings_file()}", markup=False)
+        err.print(f"the position of the rig is that in its file, not that in {settings_file()}")
     azimuth = None if heading is None else heading.value
     if site is not None and azimuth is not None and own.grid is not None:
         azimuth = true_from_grid(azimuth, site.origin, own.grid)
@@ -350,16 +350,14 @@ def locate_command(
                 kcal.report.save_map(map_, located, true, tiles=tiles, image=image, online=online)
         except KeyboardInterrupt:
             kept = ", ".join(map(str, written)) or "nothing"
-            err.print(
-                f"interrupted after {sample.count:,} rows; written: {kept}; other files are as they were", markup=False
-            )
+            err.print(f"interrupted after {sample.count:,} rows; written: {kept}; other files are as they were")
             raise typer.Exit(130) from None
     tell(
         table=str(points), rows=sample.count, statuses=sample.statuses, pixel_sigma=located.pixel_sigma,
         frame=located.frame, interval=located.interval_note, geoid=located.geoid,
     )  # fmt: skip
     if streamed:
-        err.print(counts_text(sample.count, sample.statuses), markup=False)
+        err.print(counts_text(sample.count, sample.statuses))
     else:
         _print_positions(located, true, sample.statuses, stated=stated)
         print_wrote(*written)

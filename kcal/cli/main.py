@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
 from typer.core import TyperGroup
 
 import kcal
@@ -20,7 +19,7 @@ from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
 from kcal.cli.check import check_command
 from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
-from kcal.cli.console import err, print_replaced, working
+from kcal.cli.console import err, print_label, print_replaced, working
 from kcal.cli.demo import demo_command
 from kcal.cli.detect import detect_command
 from kcal.cli.exchange import export_command, import_command, schema_command
@@ -78,7 +77,7 @@ class _Commands(TyperGroup):
                 finally:
                     print_replaced(written)
             except KeyboardInterrupt:
-                err.print(kept_text(written), markup=False)
+                err.print(kept_text(written))
                 raise typer.Exit(130) from None
 
 
@@ -136,13 +135,13 @@ def main() -> None:
     try:
         app()
     except KcalError as error:
-        err.print("[bold red]error:[/]", escape(" ".join(str(error).split())))
+        print_label("error", " ".join(str(error).split()), "bold red")
         sys.exit(1)
     except OSError as error:
         # What no command foresaw of files and folders: a disk that was taken away, a folder that may not be listed.
         name = f"{error.filename}: " if error.filename else ""
-        err.print("[bold red]error:[/]", escape(f"{name}{error.strerror or error}"))
+        print_label("error", f"{name}{error.strerror or error}", "bold red")
         sys.exit(1)
     except MemoryError:
-        err.print("[bold red]error:[/] not enough memory; use fewer or smaller inputs")
+        print_label("error", "not enough memory; use fewer or smaller inputs", "bold red")
         sys.exit(1)

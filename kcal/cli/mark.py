@@ -87,11 +87,11 @@ def mark_command(
         server = LocalServer(lambda token, hosts: marking_app(desk, token, hosts), port, fallback=port == _PORT)
         show_page(server.address, "marking page", browser=browser)
         if session.version:
-            err.print(f"continued after {session.version} actions in {session.files.log}", markup=False)
+            err.print(f"continued after {session.version} actions in {session.files.log}")
         warn(*session.notes, *filter(None, [session.trouble]))
         server.run()
     finally:
         desk.close()
     for path in (session.files.marks, session.files.points, session.files.landmarks):
         if path.exists():
-            out.print(f"wrote {path}", markup=False)
+            out.print(f"wrote {path}")

@@ -346,7 +346,7 @@ class Command(TyperCommand):
         taken.clear()
         taken.update(names)
         if names:
-            console.err.print(settings_text({name: ctx.params[name] for name in names}, settings_file()), markup=False)
+            console.err.print(settings_text({name: ctx.params[name] for name in names}, settings_file()))
         return super().invoke(ctx)
 
 

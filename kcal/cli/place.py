@@ -106,6 +106,5 @@ def place_command(
     print_wrote(output)
     out.print(
         f"next: kcal locate {output} marks.csv, with lines of name,camera,u,v; --height or --terrain where one camera "
-        "alone sees a point",
-        markup=False,
+        "alone sees a point"
     )

@@ -11,11 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from rich.markup import escape
-
 import kcal
 from kcal.cli import kinds
-from kcal.cli.console import err, out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.console import err, out, print_styled, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import cameras_and_rig, named_source, single_camera
 from kcal.cli.options import Kind
 from kcal.errors import FileError, InputError
@@ -71,7 +69,7 @@ def convert_images(
                 _convert(data, path, target, module, note)
         except (FileError, InputError) as error:
             failures.append(str(error))
-            err.print(f"[yellow]failed[/] {escape(str(error))}")
+            print_styled(f"failed {error}", "^failed", "yellow", to=err)
         advance(path.name)
     return before, failures
 
@@ -323,16 +321,14 @@ def _tell_view(camera: kcal.Camera, module: kcal.lens.Undistort, label: str) -> 
     across, down = shown.degrees
     out.print(
         f"{label}{across:.1f} x {down:.1f} degrees; {100 * shown.valid:.1f} % of pixels valid; shows "
-        f"{100 * shown.source:.1f} % of the source, the rest is cut off",
-        markup=False,
+        f"{100 * shown.source:.1f} % of the source, the rest is cut off"
     )
     shift = pupil_shift(camera, _NEAR)
     if shift >= _FELT:
         where = "far away" if math.isinf(module.at) else f"at {module.at:g} m"
         out.print(
             f"{label}the entrance pupil moves: maps are exact {where}; points at {_NEAR:g} m and far away are up to "
-            f"{shift:.2g} px apart, at {shift / _FELT * _NEAR:.2g} m {_FELT} px (--distance)",
-            markup=False,
+            f"{shift:.2g} px apart, at {shift / _FELT * _NEAR:.2g} m {_FELT} px (--distance)"
         )
     told = {"valid": shown.valid, "source_shown": shown.source, "degrees": shown.degrees, "pupil_px": shift}
     tell(**{label.removesuffix(": ") or "view": told})
@@ -448,7 +444,7 @@ def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.Output
     width, height = cameras[0].size
     share = float(module.mask.double().mean())
     text = f"rays {len(cameras)} x {height} x {width} x 6, float32; {100 * share:.1f} % of the pixels have one"
-    out.print(text, markup=False)
+    out.print(text)
     out.print(f"rounding: at most {error:.1e} px from the pixel, at 1 m and far away")
     if moved:
         out.print(f"the rays start up to {1e3 * moved:.3g} mm from each other on the axis: the entrance pupil moves")

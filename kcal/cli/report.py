@@ -7,18 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
-from rich.text import Text
 
 import kcal
 from kcal.cli import kinds
-from kcal.cli.console import out, print_wrote, steps, tell
+from kcal.cli.console import print_styled, print_wrote, steps, tell
 from kcal.cli.inputs import CAMERA_OR_RIG, pixel_sigma_of, single_camera
 from kcal.cli.options import Several
 from kcal.cli.rig_sources import cameras_of_files, check_views_of
 from kcal.errors import InputError
 from kcal.file_kind import file_kind
 from kcal.files import check_writable
-from kcal.texts import visible
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -92,10 +90,8 @@ def told_usable(found: Judged, page: Path | None, warned: Iterable[Finding] = ()
 
     verdict, pictures, tables = found
     for line in verdict.lines(warned):
-        text = Text(visible(line))
-        for words, style in ((r"^(YES|NO)\b", "bold"), ("^  met", "green"), ("^  missed", "red")):
-            text.highlight_regex(words, style)
-        out.print(text)
+        style = {"  met:": "green", "  miss": "red"}.get(line[:6], "bold")
+        print_styled(line, r"^(YES|NO\b|  met(?=:)|  missed(?=:))", style)
     if page is not None:
         ranges = [range_rows(verdict)] if verdict.answers else []
         with steps("drawing", None):

@@ -12,7 +12,7 @@ import typer
 
 import kcal
 from kcal.cli import kinds
-from kcal.cli.console import err, out, print_table, print_wrote, warn
+from kcal.cli.console import out, print_label, print_styled, print_table, print_wrote, warn
 from kcal.cli.inputs import pixel_sigma_and_source, pixel_sigma_of
 from kcal.cli.options import Command, Rare, declared, group_with_default
 from kcal.cli.rig_options import Sources
@@ -164,16 +164,16 @@ def check(
     print_turns(drift, f"{sum(item.used for item in drift.items)} of {len(drift.items)}")
     _print_effect(drift)
     for item in drift.left_out:
-        err.print("[yellow]left out:[/]", f"{item.name}: {item.reason}")
+        print_label("left out", f"{item.name}: {item.reason}")
     if drift.variance > 1:
         times = f"{drift.variance**0.5:.1f} times"
         warn(f"residuals are {times} as large as the marks' noise says; sigmas were multiplied by that")
     if drift.significant:
-        out.print("the relative attitude has [bold]changed[/] beyond chance: ranges by the old rig are wrong")
+        print_styled("the relative attitude has changed beyond chance: ranges by the old rig are wrong", "changed")
     else:
         out.print("no change of the relative attitude beyond chance")
     if drift.left_significant:
-        out.print("the left camera has [bold]turned[/] beyond chance: directions by the old rig are wrong")
+        print_styled("the left camera has turned beyond chance: directions by the old rig are wrong", "turned")
     if not (drift.significant or drift.left_significant):
         if relock is not None:
             out.print("nothing was written")
@@ -220,7 +220,7 @@ def replace_rig(path: Path, new: kcal.Rig) -> None:
         names = (path.with_name(f"{path.stem}.before-{now_stamp()}{more}{path.suffix}") for more in numbers)
         kept = next(name for name in names if not name.exists())
         write_atomic(kept, path.read_bytes())
-        out.print(f"kept the old rig as {kept}", markup=False)
+        out.print(f"kept the old rig as {kept}")
     kcal.save_rig(new, path)
     print_wrote(path)
 

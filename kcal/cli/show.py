@@ -51,7 +51,7 @@ def show_command(file: Annotated[Path, SHOWN]) -> None:
         _show_foreign(file)
         return
     content = read_json(read_bytes(file, MOST_BYTES), str(file))
-    out.print(f"{file}: kcal {content['kcal']} file, version {content.get('version')}", markup=False)
+    out.print(f"{file}: kcal {content['kcal']} file, version {content.get('version')}")
     if content["kcal"] == "observations":
         _show_observations(file)
         return
@@ -72,9 +72,9 @@ def _show_foreign(file: Path) -> None:
         kind = file_kind(file)
         raise FileError(f"{file}: kcal show knows camera, rig and observations files, not {kind} files")
     found = kcal.lens.import_cameras(file)
-    out.print(f"{file}: {found.format}, {len(found.cameras)} cameras", markup=False)
+    out.print(f"{file}: {found.format}, {len(found.cameras)} cameras")
     for note in found.notes:
-        out.print(f"  {note}", markup=False)
+        out.print(f"  {note}")
     for camera in found.cameras:
         _show_camera(*_derived_camera(camera))
     if found.is_rig() and (pose := _derived_rig(found.rig())[1]) is not None:
@@ -135,28 +135,24 @@ def _when(record: Mapping[str, Any]) -> str:
 
 
 def _show_camera(content: Mapping[str, Any], known: CameraSummary) -> None:
-    out.print(f"\ncamera {content['name']}".rstrip(), markup=False)
+    out.print(f"\ncamera {content['name']}".rstrip())
     share = "the whole image" if known.covers_image else "part of the image"
     width, height = content["image_size"]
-    out.print(f"{width}x{height} px, {known.model}, valid in {share}", markup=False)
+    out.print(f"{width}x{height} px, {known.model}, valid in {share}")
     if record := content["calibration"]:
         out.print(
             f"calibrated {_when(record)} by kcal {record['kcal_version']}: RMS {record['rms']:.4f} px, "
             f"{record['views']} views, {record['points']} corners, board {known.board}, "
-            f"{len(record['excluded'])} left out",
-            markup=False,
+            f"{len(record['excluded'])} left out"
         )
         if record["temperature"] is not None:
             out.print(f"at {record['temperature']:g} °C")
     if stood := content.get("setting"):
         sources = ", ".join(stood["interpolated_from"])
-        out.print(
-            f"setting {setting_text(stood['values'])}" + (f", interpolated from {sources}" if sources else ""),
-            markup=False,
-        )
+        out.print(f"setting {setting_text(stood['values'])}" + (f", interpolated from {sources}" if sources else ""))
     hybrid = content["model"].get("hybrid") is not None
     axis = ", on its axis; fx and fy below are parameters of the base projection alone" if hybrid else ""
-    out.print(f"focal length {known.focal_length}{axis}", markup=False)
+    out.print(f"focal length {known.focal_length}{axis}")
     values = {name: content["intrinsics"][name] for name in _INTRINSICS} | content["coefficients"]
     shown = _SHOWN_HYBRID if hybrid else _SHOWN
     rows = [["parameter", "value", "sigma"]]
@@ -188,11 +184,11 @@ def _show_pose(content: Mapping[str, Any], known: RigSummary) -> None:
             f"at {place['lat']:.7f}, {place['lon']:.7f}, {place['height']:.2f} m, heading {place['heading_deg']:.3f}°"
         )
     if record := content["calibration"]:
-        out.print(f"solved {_when(record)}: RMS {record['rms']:.4f} px, {record['pairs']} pairs", markup=False)
+        out.print(f"solved {_when(record)}: RMS {record['rms']:.4f} px, {record['pairs']} pairs")
         if record.get("pixel_sigma") is not None:
             out.print(f"noise of marks {record['pixel_sigma']:g} px along each axis")
         for text in record["warnings"]:
-            out.print(f"warning: {text}", markup=False)
+            out.print(f"warning: {text}")
 
 
 def _show_stations(file: Path) -> None:
@@ -204,11 +200,11 @@ def _show_stations(file: Path) -> None:
     print_stands(rig)
     out.print("error bars of cameras and poses together" if rig.root is not None else "no error bars of the poses")
     if (solved := rig.calibration) is not None:
-        out.print(f"solved {solved.created:%Y-%m-%d %H:%M %Z}: RMS {solved.rms:.4f} px", markup=False)
+        out.print(f"solved {solved.created:%Y-%m-%d %H:%M %Z}: RMS {solved.rms:.4f} px")
         for text in solved.undetermined:
-            out.print(f"open: {text}", markup=False)
+            out.print(f"open: {text}")
         for text in solved.warnings:
-            out.print(f"warning: {text}", markup=False)
+            out.print(f"warning: {text}")
 
 
 def _show_observations(file: Path) -> None:
@@ -216,9 +212,9 @@ def _show_observations(file: Path) -> None:
     seen = kcal.Observations.load(file)
     counts = [sum(pixel is not None for pixel in view.pixels) for view in seen.views]
     width, height = seen.image_size
-    out.print(f"board {seen.board}; images {width}x{height} px; refinement {seen.refinement}", markup=False)
+    out.print(f"board {seen.board}; images {width}x{height} px; refinement {seen.refinement}")
     out.print(f"{len(counts)} views with {sum(counts)} corners, {len(seen.failures)} images without")
     weights = "with" if all(view.covariance is not None for view in seen.views) else "without"
     out.print(f"corners {weights} their own covariances")
     for failure in seen.failures:
-        out.print(f"  {failure.name}: {failure.reason}", markup=False)
+        out.print(f"  {failure.name}: {failure.reason}")

@@ -238,7 +238,7 @@ def budget_command(
     if rig is None:
         out.print(f"planned rig: f {focal:g} px, baseline {baseline.value:g} m, f B {focal * baseline.value:g} px m")
     else:
-        out.print(f"{rig}: baseline {length_text(float(chosen.baseline), digits=6)}", markup=False)
+        out.print(f"{rig}: baseline {length_text(float(chosen.baseline), digits=6)}")
     rows = [["range", "error", "nearer", "farther", "first order"]]
     for i, distance in enumerate(far):
         for name, sides in found.items():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import kcal
 from kcal.cli import kinds
-from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.console import out, print_styled, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import single_camera
 from kcal.cli.options import Kind
 from kcal.errors import InputError, KcalError
@@ -198,11 +198,12 @@ def _by_stars(
         stars=count, left_out=left_out, rms_px=found.lens.rms_px, effective=found.lens.effective,
         agreement=None if found.agreement is None else found.agreement._asdict(),
     )  # fmt: skip
-    out.print(
-        f"{count} stars of {len(found.images)} images, {left_out} left out; RMS [bold]{found.lens.rms_px:.4f} px[/] "
+    text = (
+        f"{count} stars of {len(found.images)} images, {left_out} left out; RMS {found.lens.rms_px:.4f} px "
         f"along an axis; f {float(found.lens.camera.params[0]):.2f} px; the stars determine {found.lens.effective:.1f} "
         "unknowns of the lens"
     )
+    print_styled(text, r"(?<=; RMS )\S+ px")
     warn(*(f"{files[number].name}: {why}" for number, why in found.refused.items()))
     warn(*sparse_parts(found, size))
     if site is None:

@@ -14,7 +14,7 @@ import typer
 import kcal
 import kcal.cli.rig_sources as rig_sources
 from kcal.cli import console, kinds
-from kcal.cli.console import aligned, err, out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.console import aligned, out, print_label, print_styled, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_and_source
 from kcal.cli.options import Only
 from kcal.cli.report import NO, judged_sides, side_pictures, stored_tables, told_usable, warned_of
@@ -53,9 +53,8 @@ def rig_lines(result: RigResult, rig: kcal.Rig, unpaired: int) -> list[str]:
     lines = source_lines(result)
     boards, mounting = result.data.boards, rig.mounting
     lines += [
-        f"RMS [bold]{result.rms:.4f} px[/] (left {result.rms_px[0]:.4f}, right {result.rms_px[1]:.4f}); "
-        f"{result.status.message}",
-        f"baseline [bold]{measured_length(float(rig.baseline), result.sigma_baseline)}[/]",
+        f"RMS {result.rms:.4f} px (left {result.rms_px[0]:.4f}, right {result.rms_px[1]:.4f}); {result.status.message}",
+        f"baseline {measured_length(float(rig.baseline), result.sigma_baseline)}",
     ]
     if result.exact:
         lines.append(_exact_line(result, rig))
@@ -105,16 +104,16 @@ def _exact_line(result: RigResult, rig: kcal.Rig) -> str:
 def print_rig(result: RigResult, lines: list[str]) -> None:
     """Print the lines of a result, and what was turned, left out and should be doubted."""
     for line in lines:
-        out.print(line)
+        print_styled(line, r"(?<=^RMS )\S+ px|(?<=^baseline ).+")
     for turned in result.flipped:
         text = f"turned by 180°: {turned.board} ({turned.camera}; the board was read from its other end)"
-        out.print(text, markup=False)
+        out.print(text)
     for source in dict.fromkeys(item.source for item in result.left_out):
         gone = [item for item in result.left_out if item.source == source]
         for item in gone[:_MOST_NAMED]:
-            err.print("[yellow]left out:[/]", f"{item.label}: {item.reason}")
+            print_label("left out", f"{item.label}: {item.reason}")
         if len(gone) > _MOST_NAMED:
-            err.print("[yellow]left out:[/]", f"{len(gone) - _MOST_NAMED} more {source}")
+            print_label("left out", f"{len(gone) - _MOST_NAMED} more {source}")
     warn(*result.warnings)
 
 

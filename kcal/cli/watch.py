@@ -95,18 +95,18 @@ def watch_command(
         air = None if temperatures is None else Temperatures(temperatures)
         watcher = Watcher(
             known, output, every_s=every, limit_deg=limit, temperatures=air,
-            tell=lambda text: err.print(text, markup=False),
+            tell=lambda text: err.print(text),
         )  # fmt: skip
         try:
             if reference_images is not None and watcher.looks == 0 and watcher.last_time == -math.inf:
                 watcher.refer_to(*(read_gray(path) for path in reference_images))
             if watcher.offset:
-                err.print(f"continuing after {watcher.last_time:.3f} s of {output}", markup=False)
+                err.print(f"continuing after {watcher.last_time:.3f} s of {output}")
             _follow(watcher, known, (images[0], images[1]), hooks, ends=_EXIT in (alarm or []))
         finally:
             watcher.close()
         raised = watcher.alarms
-        err.print(_summary(watcher, hooks), markup=False)
+        err.print(_summary(watcher, hooks))
         if not watcher.last_time > -math.inf:
             raise InputError("no pair of images was looked at")
     with steps("fitting how it turns", None):
@@ -116,7 +116,7 @@ def watch_command(
         _draw_turns(watched, picture, limit, output.name)
     if relock is not None:
         better = relocked_by(watched)
-        out.print(("re-locked: " if better.rig else "not re-locked: ") + better.reason, markup=False)
+        out.print(("re-locked: " if better.rig else "not re-locked: ") + better.reason)
         if better.rig is not None:
             replace_rig(relock, better.rig)
     if raised:
@@ -131,7 +131,7 @@ def _follow(watcher: Watcher, rig: kcal.Rig, sources: tuple[str, str], hooks: li
             from kcal.pipeline.video_source import FramesTogether
 
         sizes = {"left": rig.left.size, "right": rig.right.size}
-        frames = FramesTogether(sources, sizes, pairs=True, tell=lambda text: err.print(text, markup=False))
+        frames = FramesTogether(sources, sizes, pairs=True, tell=lambda text: err.print(text))
 
     def stop(*_: object) -> None:
         nonlocal stopped
@@ -150,7 +150,7 @@ def _follow(watcher: Watcher, rig: kcal.Rig, sources: tuple[str, str], hooks: li
                     warn(f"{_turn_text(noticed)}: beyond the limit of {watcher.limit_deg:g}°")
                 if clocks.monotonic() >= next_word:
                     next_word = clocks.monotonic() + 10.0
-                    err.print(f"{time:.0f} s: {_turn_text(noticed)}", markup=False)
+                    err.print(f"{time:.0f} s: {_turn_text(noticed)}")
                 if stopped or (ends and noticed.begins):
                     break
     finally:
@@ -220,8 +220,7 @@ def _tell_turns(watched: kcal.rig.Watched, limit: float) -> None:
     gust = degrees * math.hypot(float(model.gust[1]), float(model.gust[4]))
     out.print(
         f"relative yaw swings by {swing:.5f}° and moves by {gust:.5f}° in the wind; without images an hour costs "
-        f"{degrees * math.sqrt(sum(hour)):.5f}°: `kcal locate --aged` needs that number where there is no history",
-        markup=False,
+        f"{degrees * math.sqrt(sum(hour)):.5f}°: `kcal locate --aged` needs that number where there is no history"
     )
 
 
