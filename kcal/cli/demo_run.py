@@ -34,6 +34,7 @@ from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks, read_marks, write_marks
 from kcal.locate.points import locate_points
 from kcal.locate.positions import interval_coverage
+from kcal.locate.survey import LOCAL, places_csv
 from kcal.report.judge_rig import rig_verdict
 from kcal.report.pages import Part, save_summary
 from kcal.report.tables import chance_text, diagonal_rows, truth_rows
@@ -370,8 +371,6 @@ def _render(scene: DemoScene, folder: Path) -> None:
 
 def _write_places(path: Path, points: NamedPoints, sigma: float | None = None) -> None:
     """Write places as a surveyor hands them over, to a millimeter with a sigma, and exactly without."""
-    lines = ["name,east,north,up" if sigma is None else "name,east,north,up,sigma"]
-    for name, place in zip(points.names, points.enu.tolist(), strict=True):
-        exact = map(repr, place)
-        lines.append(",".join([name, *(exact if sigma is None else (*(f"{v:.3f}" for v in place), f"{sigma:g}"))]))
-    write_atomic(path, "\n".join(lines) + "\n")
+    form, known = ("{!r}", "") if sigma is None else ("{:.3f}", f"{sigma:g}")
+    rows = zip(points.names, points.enu.tolist(), strict=True)
+    write_atomic(path, places_csv(LOCAL, ([name, *map(form.format, place), known, ""] for name, place in rows)))

@@ -199,13 +199,13 @@ def _natural(paths: Iterable[Path]) -> list[Path]:
 
 
 def _decoded(data: bytes, source: str | Path, flags: int) -> npt.NDArray[Any]:
-    image_header(data, source)
     if is_heif(data):
         picture = _opened_heif(data, source)
         stored = picture.transpose(_UNDONE[turns]) if (turns := _heif_turns(data)) else picture
         if flags != cv2.IMREAD_UNCHANGED:
             return np.asarray(stored.convert("L"))
         return np.ascontiguousarray(np.asarray(stored.convert("RGB"))[..., ::-1])
+    image_header(data, source)
     image, complaints = _imdecode(data, flags)
     broken = _BROKEN_JPEG.search(complaints)
     if image is None:
@@ -230,8 +230,7 @@ def image_header(data: bytes, source: str | Path) -> tuple[int, int]:
         )
     if not is_heif(data):
         return check_image_header(data, source)
-    picture = _opened_heif(data, source)
-    width, height = check_pixel_count(picture.size)
+    width, height = _opened_heif(data, source).size
     return (height, width) if _heif_turns(data) % 2 else (width, height)
 
 
@@ -245,11 +244,13 @@ def _opened_heif(data: bytes, source: str | Path) -> Image.Image:
     with suppress(ImportError):
         importlib.import_module("pillow_heif").register_heif_opener()
     try:
-        return Image.open(io.BytesIO(data))
+        picture = Image.open(io.BytesIO(data))
     except UnidentifiedImageError:
         raise FileError(
             f"{source}: a HEIC image, which needs one more package: pip install pillow-heif; or convert it to PNG"
         ) from None
+    check_pixel_count(picture.size)
+    return picture
 
 
 def _heif_turns(data: bytes) -> int:
