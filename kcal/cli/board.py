@@ -12,7 +12,7 @@ from kcal.cli import kinds
 from kcal.cli.console import out, print_wrote, steps, warn
 from kcal.cli.options import Command, Kind, declared, group_with_default
 from kcal.errors import InputError
-from kcal.files import check_writable, write_atomic
+from kcal.files import write_atomic
 
 app = typer.Typer(
     cls=group_with_default("print"), rich_markup_mode="markdown", help="Draw a board to print, and measure it later."
@@ -22,7 +22,7 @@ app = typer.Typer(
 def print_command(
     *,
     board: kinds.Board,
-    output: kinds.Output,
+    output: kinds.NewFile,
     square: kinds.Square | None = None,
     paper: Annotated[str, Kind(metavar="PAPER")] = "auto",
 ) -> None:
@@ -56,7 +56,6 @@ def print_command(
         raise InputError(f"{output}: give a file name that ends in .svg or .pdf")
     pattern = kcal.Board.parse(board, square)
     sheet = board_sheet(pattern, paper)
-    check_writable(output)
     write_atomic(output, to_svg(sheet.drawing) if suffix == ".svg" else to_pdf(sheet.drawing))
     out.print(f"{output}: {pattern}, page {sheet.drawing.width:g}x{sheet.drawing.height:g} mm")
     if sheet.quiet < 1:
@@ -71,7 +70,7 @@ def print_command(
 
 
 def measure_command(
-    observations: list[kinds.Observed], *, output: kinds.Output, picture: kinds.Picture | None = None
+    observations: list[kinds.Observed], *, output: kinds.NewFile, picture: kinds.Picture | None = None
 ) -> None:
     """Measure a printed board: how it bends, and how its print errs, each with its σ.
 
@@ -91,7 +90,6 @@ def measure_command(
     from kcal.calibrate.hybrid.cameras_fit import fit_cameras
     from kcal.report.calibration import board_figure, board_text
 
-    check_writable(output, *observations)
     sets = [kcal.Observations.load(path) for path in observations]
     names = [path.name.split(".")[0] for path in observations]
     if len(set(names)) < len(names):

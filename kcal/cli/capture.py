@@ -13,7 +13,6 @@ from kcal.cli.console import err, out, show_page
 from kcal.cli.detect import board_in_images, given_board
 from kcal.cli.options import Kind
 from kcal.errors import InputError, KcalError, with_extra
-from kcal.files import check_writable
 
 if TYPE_CHECKING:
     from kcal.capture.session import CaptureSession
@@ -25,7 +24,7 @@ _PORT = 8348
 def capture_command(
     source: Annotated[str, Kind(setting=True)],
     *,
-    output: kinds.Output,
+    output: kinds.NewFile,
     board: kinds.BoardOrAuto = "auto",
     square: kinds.Square | None = None,
     until: kinds.Pixels = 0.1,
@@ -60,7 +59,6 @@ def capture_command(
     """
     from kcal.capture.session import CaptureOptions, CaptureSession, follow, shots
 
-    check_writable(output)
     pattern = given_board(board, square)
     if pattern is None and output.exists():
         pattern = kcal.Observations.load(output).board

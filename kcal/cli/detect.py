@@ -21,7 +21,7 @@ from kcal.files import check_writable, is_stream, make_folder, source_name
 def detect_command(
     images: list[kinds.Images],
     *,
-    output: kinds.Output,
+    output: kinds.NewFile,
     board: kinds.BoardOrAuto = "auto",
     square: kinds.Square | None = None,
     refine: kinds.RefineMethod = kinds.Refine.erf,
@@ -59,7 +59,6 @@ def detect_command(
         duration: Seconds for which a stream is watched.
         keep: Folder for the frames of a video or stream that became views, as PNG.
     """
-    check_writable(output)
     given = given_board(board, square)
 
     from kcal.corners.detect import Detection

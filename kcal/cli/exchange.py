@@ -13,7 +13,7 @@ from kcal.cli import kinds
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import cameras_and_rig, named_source, picked
 from kcal.errors import InputError
-from kcal.files import check_writable, write_atomic
+from kcal.files import write_atomic
 
 # Pixels (RMS) beyond which a lens model does not stand for a lens.
 _FAR = 0.5
@@ -22,7 +22,7 @@ _FAR = 0.5
 def export_command(
     source: kinds.AnyFile,
     *,
-    output: kinds.Output,
+    output: kinds.NewFile,
     format: kinds.Name | None = None,
     model: kinds.Name | None = None,
     picture: kinds.Picture | None = None,
@@ -55,7 +55,6 @@ def export_command(
         picture: error of a refitted lens over the image.
     """
     path, name = named_source(source)
-    check_writable(output, path)
 
     found, rig = cameras_and_rig(path)
     alone = name is not None or len(found.cameras) == 1
@@ -93,7 +92,7 @@ def export_command(
 def import_command(
     sources: list[kinds.ForeignFile],
     *,
-    output: kinds.Output,
+    output: kinds.NewFile,
     format: kinds.Name | None = None,
     size: kinds.Size | None = None,
     fisheye: bool | None = None,
@@ -135,7 +134,6 @@ def import_command(
     """
     named = [named_source(source) for source in sources]
     paths, camera = [path for path, _ in named], next((name for _, name in named if name), None)
-    check_writable(output, *paths)
     what = "corners" if board is not None else "places" if paths[0].suffix.lower() in (".gpx", ".geojson") else ""
     if what and len(paths) > 1:
         raise InputError(f"{what} are read from one file{', with --board and --square' if board is not None else ''}")

@@ -231,15 +231,23 @@ class _Given(NamedTuple):
         return self.wanted.part if name else file_kind(path) in self.wanted.kinds or _unseen(text)
 
 
-def check_given(files: Sequence[tuple[str, Wanted, Any]], outputs: Sequence[Any]) -> None:
+def given_texts(value: Any) -> list[str]:
+    """What was given with an option, once or several times."""
+    return [str(one) for one in (value if isinstance(value, list | tuple) else [value]) if one is not None]
+
+
+def given_files(value: Any) -> list[str]:
+    """The files and folders among it."""
+    texts = given_texts(value)
+    return [path for text in texts for path in (text, text.rpartition(":")[0]) if os.path.exists(path)]
+
+
+def check_given(files: Sequence[tuple[str, Wanted, Any]]) -> None:
     """Refuse files that are missing, or not what is wanted, before anything is loaded.
 
     Args:
         files: what each option is called, what it must be, and what was given.
-        outputs: files to write. Where nothing can be written, the command says so first.
     """
-    if not all(Path(path).parent.is_dir() for path in outputs):
-        return
     found = [_Given(label, text, wanted) for label, wanted, given in files for text in _checked_inputs(wanted, given)]
     # Beside a stream no files are allowed at all, which the command says.
     if any(is_stream(one.text) for one in found if not one.label.startswith("-")):
@@ -312,8 +320,7 @@ def _candidates(wrong: _Given, kind: str) -> Iterator[str]:
 
 def _checked_inputs(wanted: Wanted, value: Any) -> list[str]:
     """The files that are checked: of a list of images, one that is none is listed by the command and stops nothing."""
-    values = value if isinstance(value, list | tuple) else [value]
-    texts = [str(one) for one in values if one is not None]
+    texts = given_texts(value)
     if wanted is not IMAGES or not isinstance(value, list):
         return texts
     kinds = {text: file_kind(text) for text in texts}

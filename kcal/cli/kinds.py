@@ -248,6 +248,10 @@ def _read_picture(text: str, name: str) -> Path:
 
 
 Output = Annotated[Path, Kind(flags=("-o", "--output"))]
+NewFile = Annotated[Path, Kind(flags=("-o", "--output"), writes=True)]
 Picture = Annotated[
-    Path, Kind(metavar="FILE", read=_read_picture, early=True, about="Picture to write (.png, .svg or .pdf): {}")
+    Path,
+    Kind(
+        metavar="FILE", read=_read_picture, early=True, writes=True, about="Picture to write (.png, .svg or .pdf): {}"
+    ),
 ]

@@ -17,7 +17,7 @@ from kcal.cli.inputs import pixel_sigma_and_source
 from kcal.cli.options import Kind, Rare
 from kcal.cli.settings import settings_file, taken
 from kcal.errors import DegenerateError, InputError
-from kcal.files import check_writable, written_files
+from kcal.files import written_files
 from kcal.texts import one_line
 
 if TYPE_CHECKING:
@@ -231,10 +231,10 @@ def locate_command(
     *,
     options: LocateOptions,
     truth: kinds.Survey | None = None,
-    output: list[kinds.Output] | None = None,
+    output: list[kinds.NewFile] | None = None,
     format: Rare[Annotated[str, Kind(metavar="NAME")]] = "csv",
     picture: kinds.Picture | None = None,
-    map_: Path | None = None,
+    map_: Annotated[Path, Kind(writes=True)] | None = None,
     tiles: Rare[Annotated[Path, Kind(metavar="FOLDER")] | None] = None,
     image: Rare[Annotated[Path, Kind(metavar="TIF")] | None] = None,
     online: Rare[bool] = False,
@@ -307,14 +307,10 @@ def locate_command(
     named = [f"positions{suffix}" if path == STREAM else path for path in outputs]
     for name in named:
         check_format(name)
-    for path in outputs:
-        if path != STREAM:
-            check_writable(path, rig, points, *filter(None, [truth]))
     if map_ is not None:
         from kcal.report.map_page import check_map_format
 
         check_map_format(map_)
-        check_writable(map_)
     locate, parts, note = locate_run(rig, points, options)
     empty = locate.located()
     for name in named:

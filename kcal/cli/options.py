@@ -23,9 +23,10 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from kcal.cli import console
-from kcal.cli.inputs import Wanted, check_given
+from kcal.cli.inputs import Wanted, check_given, given_files, given_texts
 from kcal.cli.settings import settings_file, settings_text, taken
 from kcal.errors import InputError, KcalError
+from kcal.files import check_writable
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,6 +43,8 @@ class Kind:
         several: whether all words up to the next option are values of this one, as in `--stars a.png b.png`.
         rare: whether only `--help-all` shows it.
         setting: whether kcal.toml may give it.
+        writes: whether it names a file to write: that is refused at once where it cannot be written, or is a file that
+            another option names.
         panel: title of the box in the help.
         about: what it is; `{}` stands for what `Args:` say of the one option.
     """
@@ -55,6 +58,7 @@ class Kind:
     several: bool = False
     rare: bool = False
     setting: bool = False
+    writes: bool = False
     panel: str | None = None
     about: str = "{}"
 
@@ -233,11 +237,11 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
     @functools.wraps(function)
     def run(*, as_json: bool = False, **given: Any) -> None:
         console.tell_anew(as_json)
-        outputs = given.get("output") or []
-        check_given(
-            [(one.label, one.wanted, given[one.name]) for one in options if one.wanted is not None],
-            outputs if isinstance(outputs, list) else [outputs],
-        )
+        others = [path for one in options if not one.kind.writes for path in given_files(given[one.name])]
+        for path in (path for one in options if one.kind.writes for path in given_texts(given[one.name])):
+            if path != "-":
+                check_writable(path, *others)
+        check_given([(one.label, one.wanted, given[one.name]) for one in options if one.wanted is not None])
         values: dict[str | None, dict[str, Any]] = {None: {}, **{name: {} for name in groups}}
         for one in options:
             values[one.group][one.name] = one.value(given[one.name])

@@ -14,7 +14,6 @@ from kcal.cli.options import Several
 from kcal.cli.rig_sources import load_cameras
 from kcal.cli.stations import camera_names, print_stands
 from kcal.errors import InputError
-from kcal.files import check_writable
 from kcal.values import WithSigma
 
 
@@ -66,7 +65,7 @@ class TypedStands:
 def place_command(
     cameras: list[kinds.CalibratedCamera],
     *,
-    output: kinds.Output,
+    output: kinds.NewFile,
     stands: TypedStands,
     places: kinds.Table | None = None,
 ) -> None:
@@ -88,7 +87,6 @@ def place_command(
         places: In place of these a table: name (of the camera), lat, lon, height, sigma, heading, heading_sigma, pitch,
             pitch_sigma, and if need be sigma_up, roll, roll_sigma.
     """
-    check_writable(output, *cameras, *filter(None, [places]))
     needed = (stands.site, stands.heading, stands.pitch)
     if (places is None) == any(value is None for value in needed) or (places and (stands.roll or any(needed))):
         raise typer.BadParameter("give --site, --heading and --pitch of each camera, or all of them in --places")

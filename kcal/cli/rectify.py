@@ -386,7 +386,7 @@ def _tell_ranges(module: kcal.lens.StereoRectification) -> None:
 # `kcal rays`: the ray of every pixel, for renderers such as gsplat.
 
 
-def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.Output, Kind(metavar="NPZ")]) -> None:
+def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.NewFile, Kind(metavar="NPZ")]) -> None:
     """Write the ray of every pixel, for Gaussian splatting and other renderers without lens models.
 
     The file has `rays` (C, H, W, 6) in float32, as gsplat takes them from version 1.6 on: origin, in meters, and
@@ -404,8 +404,6 @@ def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.Output
         sources: Camera files of one image size, or one rig file.
         output: File to write.
     """
-    paths = [named_source(source)[0] for source in sources]
-    check_writable(output, *paths)
     if output.suffix.lower() != ".npz":
         raise InputError(f"{output}: the name of the file must end with .npz")
 

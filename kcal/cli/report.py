@@ -16,7 +16,6 @@ from kcal.cli.options import Several
 from kcal.cli.rig_sources import cameras_of_files, check_views_of
 from kcal.errors import InputError
 from kcal.file_kind import file_kind
-from kcal.files import check_writable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -39,7 +38,7 @@ def report_command(
     require: kinds.Needs | None = None,
     baseline: kinds.Baseline = 10.0,
     pixel_sigma: kinds.PixelSigma | None = None,
-    output: kinds.Output | None = None,
+    output: kinds.NewFile | None = None,
 ) -> None:
     """May I use this camera or rig? Yes or no for each range, one reason, and the next picture to take.
 
@@ -66,8 +65,6 @@ def report_command(
     """
     subject, needs = camera_or_rig, require or ()
     given = observations or []
-    if output is not None:
-        check_writable(output, subject, *given)
     found = (
         _of_rig(subject, given, needs, pixel_sigma)
         if file_kind(subject) == "rig"

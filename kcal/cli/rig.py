@@ -6,7 +6,7 @@ import datetime
 import itertools
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -14,7 +14,7 @@ import kcal
 from kcal.cli import kinds
 from kcal.cli.console import out, print_label, print_styled, print_table, print_wrote, warn
 from kcal.cli.inputs import pixel_sigma_and_source, pixel_sigma_of
-from kcal.cli.options import Command, Rare, declared, group_with_default
+from kcal.cli.options import Command, Kind, Rare, declared, group_with_default
 from kcal.cli.rig_options import Sources
 from kcal.cli.stations import solve_and_write
 from kcal.errors import InputError
@@ -32,10 +32,10 @@ def solve_command(
     right: kinds.CalibratedCamera,
     others: list[kinds.CalibratedCamera] | None = None,
     *,
-    output: kinds.Output,
+    output: kinds.NewFile,
     sources: Sources,
     require: kinds.Needs | None = None,
-    report: Path | None = None,
+    report: Annotated[Path, Kind(writes=True)] | None = None,
     intrinsics: Rare[Literal["prior", "fixed", "free"]] = "prior",
     keep_all: Rare[bool] = False,
     board_warp: Rare[bool] = False,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Annotated
 
 from kcal.cli import kinds
@@ -95,13 +94,6 @@ class Sources:
     def refraction_sigma(self) -> float:
         """Of the refraction, as given, or as it is by day over land."""
         return _REFRACTION_SIGMA if self.refraction.sigma is None else self.refraction.sigma
-
-    @property
-    def files(self) -> list[Path]:
-        """All files that are read."""
-        single = (self.match, self.landmarks, self.marks, self.features, self.positions, self.terrain)
-        more = (*(self.pairs or ()), *(self.tracks or ()))
-        return [*more, *(path for path in single if path is not None)]
 
     @property
     def given(self) -> bool:

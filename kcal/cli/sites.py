@@ -13,7 +13,7 @@ from kcal.cli.options import Kind
 from kcal.cli.stars import print_star_budget
 from kcal.errors import InputError
 from kcal.file_kind import file_kind
-from kcal.files import check_writable, write_atomic
+from kcal.files import write_atomic
 from kcal.table import Table
 from kcal.texts import length_text, range_text
 from kcal.values import WithSigma
@@ -34,7 +34,7 @@ def sites_command(
     above: kinds.Meters = 0.0,
     cells: Annotated[int, Kind(metavar="N", least=10)] = 200,
     pixel_sigma: kinds.PixelSigma | None = None,
-    output: kinds.Output | None = None,
+    output: kinds.NewFile | None = None,
     picture: kinds.Picture | None = None,
 ) -> None:
     """Where to put the next camera: a map of what towers see and how well they locate it, and candidates in order.
@@ -68,8 +68,6 @@ def sites_command(
     from kcal.locate.siting import read_sites, sites_of, siting_map
     from kcal.locate.stations import stations_of
 
-    for path in filter(None, (output, picture)):
-        check_writable(path, *filter(None, (towers, candidates, terrain)))
     if (terrain is None) == (ground is None):
         raise InputError("give --terrain, or --ground with the height of level ground above the ellipsoid; one of them")
     surface = (

@@ -20,7 +20,6 @@ from kcal.cli.options import Only
 from kcal.cli.report import NO, judged_sides, side_pictures, stored_tables, told_usable, warned_of
 from kcal.cli.rig_options import Sources
 from kcal.errors import InputError
-from kcal.files import check_writable
 from kcal.texts import length_text, measured_length, measured_text, number_text
 
 if TYPE_CHECKING:
@@ -167,8 +166,6 @@ def solve_and_write(
         raise InputError("--match is for rigs of two cameras; views belong together by their names")
     if not two and sources.scene:
         raise InputError("--scene is for rigs of two cameras; give matches as a table by --features")
-    for path in filter(None, (output, report)):
-        check_writable(path, *paths, *sources.files)
     cameras = rig_sources.load_cameras(paths)
     if two:
         rig_sources.check_sides(cameras, paths)
@@ -295,7 +292,7 @@ _OF_ONE = (
 def station_command(
     camera: kinds.CalibratedCamera,
     *,
-    output: kinds.Output,
+    output: kinds.NewFile,
     sources: Annotated[Sources, Only(_OF_ONE)],
 ) -> None:
     """Solve how one camera stands on the Earth: position, heading, pitch and roll, with error bars.

@@ -33,7 +33,7 @@ def watch_command(
     rig: kinds.RigFile,
     images: list[str] | None = None,
     *,
-    output: Annotated[kinds.Output, Kind(metavar="CSV")],
+    output: Annotated[kinds.NewFile, Kind(metavar="CSV")],
     every: Annotated[float, Kind(metavar="S", least=1.0)] = 60.0,
     reference_images: Annotated[tuple[Path, Path], Kind(metavar="LEFT RIGHT")] | None = None,
     temperatures: kinds.History | None = None,
@@ -85,7 +85,6 @@ def watch_command(
         raise typer.BadParameter("two folders, videos or addresses, of the left and the right camera, are needed")
     if output.suffix.lower() != ".csv":
         raise typer.BadParameter(f"--output {output}: a name that ends with .csv is needed")
-    check_writable(output, rig)
     if relock is not None:
         check_writable(relock, output)
     hooks = [Webhook(address) for address in alarm or [] if address != _EXIT]

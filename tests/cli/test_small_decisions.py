@@ -150,12 +150,3 @@ class TestSources:
                               ("mill=3±1", "FIRST:SECOND=LENGTH"), ("3±1", "of 3 cameras")):  # fmt: skip
             with pytest.raises(InputError, match=message):
                 parse_baselines(text, names)
-
-    def test_files(self) -> None:
-        """All that are read, those of a kind in their order."""
-        some = Sources(
-            pairs=[Path("l"), Path("r")], match=Path("m"), landmarks=Path("a"), features=Path("f"),
-            tracks=(Path("t"), Path("u")), terrain=Path("d"),
-        )  # fmt: skip
-        assert [str(path) for path in some.files] == ["l", "r", "t", "u", "m", "a", "f", "d"]
-        assert Sources().files == []
