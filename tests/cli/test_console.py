@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import re
 import shlex
@@ -21,12 +22,13 @@ from board_render import homography, render
 from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 from command_line import Command
 from locate_rigs import pinhole_rig
+from rich.console import Console
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 from waiting import PATIENCE
 
 from kcal import Board, Camera, Observations, View, load_rig, save_camera
-from kcal.cli.console import err, out, print_table, print_wrote, steps, warn
+from kcal.cli.console import err, out, print_styled, print_table, print_wrote, steps, warn
 from kcal.cli.init import toml_text
 from kcal.cli.main import app, main, usage_errors_shown
 from kcal.cli.settings import SETTINGS, defaults_of, read_settings
@@ -98,8 +100,11 @@ def test_a_message_about_wrong_use_is_cleaned_of_itself() -> None:
     assert caught.value.format_message() == r"Invalid value: a\x1b]0;title\x07\x1b[2J\x9b31m\x85:bomb:"
 
 
-def test_the_library_s_own_colors_stay() -> None:
-    assert err.render_str("[red]x[/]").spans[0].style == "red"
+def test_kcal_s_own_styles_stay_and_brackets_are_none() -> None:
+    assert err.render_str("[red]x[/]").plain == "[red]x[/]"
+    screen = Console(file=io.StringIO(), force_terminal=True, color_system="standard", markup=False)
+    print_styled("error: [red]x[/]\x1b", "^error:", "red", to=screen)
+    assert screen.file.getvalue() == "\x1b[31merror:\x1b[0m [red]x[/]\\x1b\n"
 
 
 @pytest.mark.parametrize(
