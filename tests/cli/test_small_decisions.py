@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command_line import Command
 from typer.testing import CliRunner, Result
 
 from kcal.cli.demo_practice import _first
@@ -50,6 +51,20 @@ def test_the_first_result_that_is_there(tmp_path: Path) -> None:
     assert _first(tmp_path, ("a", "b")) == tmp_path / "b"
     (tmp_path / "a").touch()
     assert _first(tmp_path, ("a", "b")) == tmp_path / "a"
+
+
+@pytest.mark.parametrize(("words", "message"), [
+    ("-o hills.asc", "hills.asc: this is an input"), ("-o no/map.csv", "the folder no does not exist"),
+    ("--picture towers.png", "towers.png: this is an input"), ("-o .", ".: is a folder"),
+])  # fmt: skip
+def test_what_cannot_be_written_is_refused_first(
+    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
+) -> None:
+    """Whatever option names the file that would be lost."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("hills.asc", "towers.png"):
+        (tmp_path / name).write_text("mine")
+    assert message in command.refuses("sites towers.png --area 1,2,3,4 --terrain hills.asc", words)
 
 
 class Server:
