@@ -73,7 +73,7 @@ def fit_ellipses(image: npt.NDArray[np.generic], center: Tensor, shape: Tensor, 
     where, levels, weight = _pixels(image, center, shape, reach)
     p = torch.zeros(len(center), PARAMETERS, dtype=torch.float64)
     p[:, 2], p[:, 3], p[:, 4] = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
-    rho = torch.linalg.vector_norm(torch.einsum("mij,mkj->mki", shape, where), dim=-1)
+    rho = torch.linalg.vector_norm(where @ shape.to(where), dim=-1)  # B is symmetric
     inside, outside = weight * (rho < 0.7), weight * (rho > 1.25)
     dark, light = ((share * levels).sum(-1) / share.sum(-1).clamp_min(1e-9) for share in (inside, outside))
     p[:, 5], p[:, 6], p[:, 7] = light, dark - light, 0.8
@@ -81,30 +81,30 @@ def fit_ellipses(image: npt.NDArray[np.generic], center: Tensor, shape: Tensor, 
     size = torch.linalg.det(shape).clamp_min(1e-12).rsqrt()
     lam = torch.full((len(p),), 1e-3, dtype=torch.float64)
     cost, normal, gradient = _system(p, where, levels, weight)
-    step = torch.full((len(p), 2), math.inf, dtype=torch.float64)
-    done = torch.zeros(len(p), dtype=torch.bool)
+    # What rounding of the levels may do to a cost.
+    rounding = torch.finfo(levels.dtype).eps * (weight * levels.square()).sum(-1).double().sqrt()
+    step = torch.full((len(p),), math.inf, dtype=torch.float64)
+    on = torch.arange(len(p))  # those that have not converged
     for _ in range(_STEPS):
-        diagonal = normal.diagonal(dim1=-2, dim2=-1)
-        damped = normal + torch.diag_embed(
-            lam[:, None] * diagonal + 1e-9 * diagonal.amax(-1, keepdim=True).clamp_min(1e-30)
+        diagonal = normal[on].diagonal(dim1=-2, dim2=-1)
+        damped = normal[on] + torch.diag_embed(
+            lam[on, None] * diagonal + 1e-9 * diagonal.amax(-1, keepdim=True).clamp_min(1e-30)
         )
-        move = -torch.linalg.solve_ex(damped, gradient[..., None])[0][..., 0]
-        move[:, :2] *= (0.3 * size / move[:, :2].norm(dim=-1).clamp_min(1e-12)).clamp_max(1.0)[:, None]
-        trial = p + move
+        move = -torch.linalg.solve_ex(damped, gradient[on, :, None])[0][..., 0]
+        move[:, :2] *= (0.3 * size[on] / move[:, :2].norm(dim=-1).clamp_min(1e-12)).clamp_max(1.0)[:, None]
+        trial = p[on] + move
         trial[:, 7] = trial[:, 7].clamp(_LEAST_BLUR, None)
-        new_cost, new_normal, new_gradient = _system(trial, where, levels, weight)
-        better = (new_cost < cost) & _is_ellipse(trial)
-        step = torch.where(better[:, None], move[:, :2], step)
-        p = torch.where(better[:, None], trial, p)
-        cost = torch.where(better, new_cost, cost)
-        normal = torch.where(better[:, None, None], new_normal, normal)
-        gradient = torch.where(better[:, None], new_gradient, gradient)
-        lam = torch.where(better, lam / 4, lam * 6).clamp(1e-9, 1e9)
+        found = _system(trial, where[on], levels[on], weight[on])
+        better = (found[0] < cost[on] + rounding[on] * cost[on].sqrt()) & _is_ellipse(trial)
+        moved = on[better]
+        step[moved], p[moved] = move[better, :2].norm(dim=-1), trial[better]
+        cost[moved], normal[moved], gradient[moved] = (each[better] for each in found)
+        lam[on] = torch.where(better, lam[on] / 4, lam[on] * 6).clamp(1e-9, 1e9)
         # Where no damping improves a step, the fit has converged as well.
-        done |= (better & (step.norm(dim=-1) < 0.1 * _CONVERGED)) | (lam > 1e6)
-        if bool(done.all()):
+        on = on[~((better & (step[on] < 0.1 * _CONVERGED)) | (lam[on] > 1e6))]
+        if not len(on):
             break
-    freedom = (weight.sum(-1) - PARAMETERS).clamp_min(1.0)
+    freedom = (weight.sum(-1).double() - PARAMETERS).clamp_min(1.0)
     noise = cost / freedom
     unit = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).sqrt()
     scaled = normal / (unit[:, :, None] * unit[:, None, :]) + 1e-12 * torch.eye(PARAMETERS, dtype=torch.float64)
@@ -116,7 +116,7 @@ def fit_ellipses(image: npt.NDArray[np.generic], center: Tensor, shape: Tensor, 
         p[:, 7],
         p[:, 6],
         noise.sqrt() / p[:, 6].abs().clamp_min(1e-9),
-        step.norm(dim=-1) < _CONVERGED,
+        step < _CONVERGED,
     )
 
 
@@ -143,57 +143,54 @@ def _pixels(
     places = base[:, None] + torch.stack([x, y], -1).reshape(1, -1, 2)
     u, v = places.unbind(-1)
     within = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    levels = torch.from_numpy(image[v.clamp(0, height - 1).numpy(), u.clamp(0, width - 1).numpy()].astype(np.float64))
-    where = places - center[:, None]
-    rho = torch.linalg.vector_norm(torch.einsum("mij,mkj->mki", shape, where), dim=-1)
-    weight = ((rho <= reach[:, None]) & within).double()
+    kind = np.float64 if image.dtype == np.float64 else np.float32
+    levels = torch.from_numpy(image[v.clamp(0, height - 1).numpy(), u.clamp(0, width - 1).numpy()].astype(kind))
+    where = (places - center[:, None]).to(levels)
+    rho = torch.linalg.vector_norm(where @ shape.to(where), dim=-1)
+    weight = ((rho <= reach[:, None]) & within).to(where)
     used = (weight > 0).any(0)
     return where[:, used], levels[:, used], weight[:, used]
 
 
 def _system(p: Tensor, where: Tensor, levels: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Sum of squared residuals (M,), normal matrices (M, P, P) and gradients (M, P)."""
-    b = _shape(p)
-    q = where - p[:, None, :2]
-    w = q @ b  # B is symmetric
-    rho = torch.linalg.vector_norm(w, dim=-1).clamp_min(1e-6)
-    g = w @ b
-    length = torch.linalg.vector_norm(g, dim=-1).clamp_min(1e-9)
-    top = rho**2 - rho
-    distance = top / length
-    blur = p[:, 7:8]
-    t = distance / blur
+    cx, cy, b00, b01, b11, light, contrast, blur, ramp_x, ramp_y = p.to(where)[..., None].unbind(1)
+    x, y = where.unbind(-1)
+
+    def shaped(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        return b00 * u + b01 * v, b01 * u + b11 * v
+
+    qx, qy = x - cx, y - cy
+    wx, wy = shaped(qx, qy)
+    rho = torch.hypot(wx, wy).clamp_min(1e-6)
+    gx, gy = shaped(wx, wy)
+    length = torch.hypot(gx, gy).clamp_min(1e-9)
+    distance = (rho**2 - rho) / length
+    t = (distance / blur).clamp(-9.0, 9.0)  # denormal densities are slow
     share = 0.5 * torch.erfc(t / math.sqrt(2.0))
     density = torch.exp(-0.5 * t.square()) / (math.sqrt(2.0 * math.pi) * blur)
-    ramp = torch.einsum("mkj,mj->mk", where, p[:, 8:])
-    model = p[:, 5:6] + p[:, 6:7] * share + ramp
-    # d distance by q: (2 - 1/ρ) Bw / |g| - top / |g|³ B B g, and by an element of B likewise.
-    slope = 2.0 - 1.0 / rho
-    bbg = (g @ b) @ b
-    by_q = (slope / length)[..., None] * g - (top / length**3)[..., None] * bbg
-    columns = [-by_q[..., 0], -by_q[..., 1]]
-    bg = g @ b
-    for i, j in ((0, 0), (0, 1), (1, 1)):
-        # dB = E: dw = E q, d ρ = w·dw / ρ, dg = E w + B dw.
-        dw = torch.zeros_like(q)
-        ew = torch.zeros_like(q)
-        dw[..., i], ew[..., i] = q[..., j], w[..., j]
-        if i != j:
-            dw[..., j], ew[..., j] = q[..., i], w[..., i]
-        d_top = slope * (w * dw).sum(-1)
-        d_length = ((g * ew).sum(-1) + (bg * dw).sum(-1)) / length
-        columns.append(d_top / length - top / length**2 * d_length)
-    scale = -p[:, 6:7] * density
-    one = torch.ones_like(share)
+    residual = light + contrast * share + ramp_x * x + ramp_y * y - levels
+    # d distance by q: (2 - 1/ρ) Bw / |g| - top / |g|³ B B g; by an element of B: dw = E q, d ρ = w·dw / ρ, and
+    # dg = E w + B dw.
+    scale = -contrast * density
+    near, far = scale * (2.0 - 1.0 / rho) / length, scale * distance / length**2
+    hx, hy = shaped(gx, gy)
+    kx, ky = shaped(hx, hy)
     jacobian = torch.stack(
-        [*(scale * column for column in columns), one, share, p[:, 6:7] * density * t, where[..., 0], where[..., 1]], -1
-    )
-    residual = model - levels
-    weighted = weight[..., None] * jacobian
+        [
+            far * kx - near * gx,
+            far * ky - near * gy,
+            near * wx * qx - far * (gx * wx + hx * qx),
+            near * (wx * qy + wy * qx) - far * (gx * wy + gy * wx + hx * qy + hy * qx),
+            near * wy * qy - far * (gy * wy + hy * qy),
+            torch.ones_like(share), share, -scale * t, x, y,
+        ], 1
+    )  # fmt: skip
+    weighted = weight[:, None] * jacobian
     return (
-        (weight * residual.square()).sum(-1),
-        weighted.transpose(1, 2) @ jacobian,
-        torch.einsum("mkp,mk->mp", weighted, residual),
+        (weight * residual.square()).sum(-1).double(),
+        (weighted @ jacobian.mT).double(),
+        (weighted @ residual[..., None])[..., 0].double(),
     )
 
 

@@ -51,20 +51,23 @@ def inliers(
     placed: npt.NDArray[np.floating], seen: npt.NDArray[np.floating], tolerance: float
 ) -> npt.NDArray[np.bool_]:
     """Which markers `agreeing` counts, (M,)."""
-    count = len(placed)
-    best = np.zeros(count, bool)
-    if count < 2:
-        return ~best
-    pairs = [(i, j) for i in range(count) for j in range(i + 1, count)]
-    step = max(1, len(pairs) // _TRIES)
-    for i, j in pairs[::step]:
-        found = board_homography(placed[[i, j]].reshape(-1, 2), seen[[i, j]].reshape(-1, 2))
-        if found is None:
-            continue
-        good = _misses(found, placed, seen) < tolerance
-        if good.sum() > best.sum():
-            best = good
-    return best
+    if len(placed) < 2:
+        return np.ones(len(placed), bool)
+    pairs = np.stack(np.triu_indices(len(placed), 1), 1)
+    pairs = pairs[:: max(1, len(pairs) // _TRIES)]
+    # All pairs at once, by linear least squares in units of the markers' spread.
+    middle, size = seen.mean((0, 1)), seen.std() + 1e-9
+    seen = (seen - middle) / size
+    a, b = seen[pairs].reshape(-1, 8, 2), (placed[pairs] / tolerance).reshape(-1, 8, 2)
+    plain = np.concatenate([a, np.ones_like(a[..., :1])], -1)
+    rows = [np.concatenate([plain * (k == 0), plain * (k == 1), -b[..., k, None] * a], -1) for k in (0, 1)]
+    design = np.concatenate(rows, 1)
+    right = np.concatenate([b[..., 0], b[..., 1]], 1)[..., None]
+    h = np.concatenate([np.linalg.pinv(design) @ right, np.ones((len(pairs), 1, 1))], 1).reshape(-1, 1, 3, 3)
+    there = np.concatenate([seen, np.ones_like(seen[..., :1])], -1) @ h.transpose(0, 1, 3, 2)
+    miss = np.linalg.norm(there[..., :2] / there[..., 2:] - placed / tolerance, axis=-1).mean(-1)
+    good: npt.NDArray[np.bool_] = miss < 1.0
+    return good[good.sum(1).argmax()]
 
 
 def in_place(
@@ -159,11 +162,11 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
     """
     if board.dictionary is None:
         raise InputError(f"{board}: not a ChArUco board")
-    found, others = read_markers(image, board, board.dictionary)
+    found = read_markers(image, board, board.dictionary)
     if len(found) < _MIN_MARKERS:  # a board that is printed white on black
         inverted = read_markers(255 - image, board, board.dictionary)
-        if len(inverted[0]) > len(found):
-            image, (found, others) = 255 - image, inverted
+        if len(inverted) > len(found):
+            image, found = 255 - image, inverted
     own = _single(found)
     twice = sorted(found.keys() - own)
     if twice:
@@ -173,8 +176,8 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
     seen = own
     if len(own) < FEW * board.markers:
         # Markers with wrong bits as well, and small ones. Those that are read wrongly do not lie where they should.
-        more, _ = read_markers(image, board, board.dictionary, correction=1.0)
-        seen = read_enlarged(image, board, board.dictionary)[0] | _single(more) | own
+        more = read_markers(image, board, board.dictionary, correction=1.0)
+        seen = read_enlarged(image, board, board.dictionary) | _single(more) | own
     today, before = ({} if len(seen) < _MIN_MARKERS else _fitting_markers(seen, board, old) for old in (False, True))
     told: bool | None = None
     if board.rows % 2 and len(seen) >= _MIN_MARKERS:
@@ -198,15 +201,21 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
     fitting = max(len(placed.keys() & own) for placed in (today, before))
     if len(own) >= _MIN_MARKERS and fitting < _MIN_FITTING * len(own):
         reason = "the markers do not lie as on this board: check its columns, rows, dictionary and first number"
-    elif others and not own:
+    elif not own and (others := read_markers(image, board, board.dictionary, others=True)):
         reason += f"; markers {min(others)} to {max(others)} of {board.dictionary} are another board's"
     return FoundCharuco(None, reason)
 
 
 def read_markers(
-    image: npt.NDArray[np.uint8], board: Board, dictionary: str, border: int = 1, correction: float = 0.6
-) -> tuple[dict[int, list[npt.NDArray[np.float64]]], list[int]]:
-    """The board's markers by number, and other numbers that were seen.
+    image: npt.NDArray[np.uint8],
+    board: Board,
+    dictionary: str,
+    border: int = 1,
+    correction: float = 0.6,
+    *,
+    others: bool = False,
+) -> dict[int, list[npt.NDArray[np.float64]]]:
+    """The board's markers by number.
 
     Args:
         image: (H, W).
@@ -214,37 +223,40 @@ def read_markers(
         dictionary: their name.
         border: cells.
         correction: share of the wrong bits that the dictionary allows to correct.
+        others: those of the dictionary instead that are not the board's. In large dictionaries that takes long.
     """
     options = cv2.aruco.DetectorParameters()
     options.markerBorderBits, options.errorCorrectionRate = border, correction
     options.perspectiveRemovePixelPerCell = 8
-    found, numbers, _ = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), options).detectMarkers(image)
+    whole, own = opencv_dictionary(dictionary), range(board.first, board.first + board.markers)
+    # OpenCV compares what it takes for a marker with all that it may be, one after the other.
+    known = whole.bytesList if others else whole.bytesList[own.start : own.stop]
+    reader = cv2.aruco.ArucoDetector(cv2.aruco.Dictionary(known, whole.markerSize, whole.maxCorrectionBits), options)
+    found, places, _ = reader.detectMarkers(image)
     markers: dict[int, list[npt.NDArray[np.float64]]] = {}
-    others: list[int] = []
-    for corners, number in zip(found, [] if numbers is None else map(int, numbers.reshape(-1)), strict=True):
-        if board.first <= number < board.first + board.markers:
+    for corners, place in zip(found, [] if places is None else map(int, places.reshape(-1)), strict=True):
+        number = place if others else place + own.start
+        if (number in own) != others:
             markers.setdefault(number, []).append(np.asarray(corners, np.float64).reshape(4, 2))
-        else:
-            others.append(number)
-    return markers, others
+    return markers
 
 
 def read_enlarged(
     image: npt.NDArray[np.uint8], board: Board, dictionary: str, border: int = 1, sharpen: float = 0.0
-) -> tuple[Markers, list[int]]:
+) -> Markers:
     """The same in an image twice as large, where OpenCV reads markers of 20 px and less.
 
     More wrong bits are corrected: a marker that is read wrongly does not lie where it should. `sharpen` adds a share of
     what a blur of 1.5 px takes away.
     """
     if image.size > MOST_ENLARGED:
-        return {}, []
+        return {}
     double = np.asarray(cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), np.uint8)
     if sharpen:
         soft = cv2.GaussianBlur(double, (0, 0), 3.0)
         double = np.asarray(cv2.addWeighted(double, 1.0 + sharpen, soft, -sharpen, 0.0), np.uint8)
-    found, others = read_markers(double, board, dictionary, border, correction=1.0)
-    return {number: (corners + 0.5) / 2 - 0.5 for number, corners in _single(found).items()}, others
+    found = read_markers(double, board, dictionary, border, correction=1.0)
+    return {number: (corners + 0.5) / 2 - 0.5 for number, corners in _single(found).items()}
 
 
 def _single(found: dict[int, list[npt.NDArray[np.float64]]]) -> Markers:
@@ -359,8 +371,8 @@ def find_aprilgrid(image: npt.NDArray[np.uint8], board: Board) -> FoundTags:
     """
     assert board.gap is not None
     nothing = torch.full((board.corners,), float("nan"), dtype=torch.float64)
-    border, tags, others = _most_tags(image, board)
-    if others and not tags:
+    border, tags = _most_tags(image, board)
+    if not tags and (others := [n for size in BORDERS for n in read_markers(image, board, TAGS, size, others=True)]):
         return FoundTags(
             None,
             nothing,
@@ -402,23 +414,17 @@ def find_aprilgrid(image: npt.NDArray[np.uint8], board: Board) -> FoundTags:
     return FoundTags(pixels, side)
 
 
-def _most_tags(
-    image: npt.NDArray[np.uint8], board: Board
-) -> tuple[int, dict[int, list[npt.NDArray[np.float64]]], list[int]]:
-    """The border with which most tags are read, the board's tags by number, and other numbers that were seen."""
-    best: tuple[int, dict[int, list[npt.NDArray[np.float64]]], list[int]] = (BORDERS[0], {}, [])
-    for border in BORDERS:
-        tags, others = read_markers(image, board, TAGS, border)
-        if (len(tags), len(others)) > (len(best[1]), len(best[2])):
-            best = border, tags, others
-    border, tags, others = best
+def _most_tags(image: npt.NDArray[np.uint8], board: Board) -> tuple[int, dict[int, list[npt.NDArray[np.float64]]]]:
+    """The border with which most tags are read, and the board's tags by number."""
+    read = {border: read_markers(image, board, TAGS, border) for border in BORDERS}
+    border = max(BORDERS, key=lambda border: len(read[border]))
+    tags = read[border]
     for sharpen, enough_tags in ((0.0, 1.0), (_SHARPEN, FEW)):
         if len(tags) >= enough_tags * board.markers:
             break
-        large, more = read_enlarged(image, board, TAGS, border, sharpen)
+        large = read_enlarged(image, board, TAGS, border, sharpen)
         tags |= {number: [corners] for number, corners in large.items() if number not in tags}
-        others += more
-    return border, tags, others
+    return border, tags
 
 
 def nearer(image: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64], edge: float) -> npt.NDArray[np.float64]:
