@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -237,18 +238,21 @@ class BoardPart(NamedTuple):
     other: bool = False
 
 
-def find_part(image: npt.NDArray[np.uint8], board: Board, seeds: Iterable[Tensor]) -> BoardPart:
+def find_part(
+    image: npt.NDArray[np.uint8], board: Board, seeds: Iterable[Tensor], best: BoardPart | None = None
+) -> BoardPart:
     """Find the visible corners of a board that is cut by the image's edge, covered or glaring in places.
 
     Args:
         image: (H, W) uint8.
         board: the board.
         seeds: grids of corners (rows, columns, 2) in the image, such as detectors find; they are tried in turn.
+        best: what other seeds gave.
 
     Returns:
         The corners; without a reason if there is no grid at all.
     """
-    best = BoardPart(None)
+    best = best or BoardPart(None)
     for seed in seeds:
         whole = without_false_sides(image, seed)
         if whole is None or uneven(image, whole) is not None:
@@ -419,17 +423,45 @@ def find_board(image: npt.NDArray[np.uint8], board: Board) -> FoundBoard:
 
     `findChessboardCorners` goes first: it is the fastest and finds most boards. `findChessboardCornersSB` (A. Duda and
     U. Frese, BMVC 2018) finds blurred ones that the first does not; on an image of equalized local contrast, shadowed
-    ones. Where none finds the whole board, a part is sought whose place in the board is certain
-    (`find_part`). Images above 1200 px are searched at that size, then at 2400 px.
+    ones. Before these two, a part is sought whose place in the board is certain (`find_part`): they are left out where
+    the image shows all of the board or another one for certain, or cuts it; otherwise the part is what they leave.
+    Images above 1200 px are searched at that size, then at 2400 px.
 
     Args:
         image: (H, W) uint8.
         board: a checkerboard of at least 3x3 inner corners.
     """
-    missing = FoundBoard(None, reason=f"no board of {board.columns}x{board.rows} inner corners found")
     sizes = [(factor, *_reduced_8bit(image, factor)) for factor in _factors(image)]
+    factor, small, scale = sizes[0]
+    whole = _find_whole(sizes[:1], board, (_find_classic,))
+    if whole.pixels is not None:
+        return whole
+    grids = seeds(small)
+    part = find_part(small, board, itertools.islice(grids, 1))
+    if not _is_all(small, part, board):
+        others = (find_sector, _find_shadowed)
+        found = [_find_whole(sizes[:1], board, others)]
+        found += [] if found[0].pixels is not None else [_find_whole(sizes[1:], board, (_find_classic, *others))]
+        if found[-1].pixels is not None:
+            return found[-1]
+        whole = next((each for each in (whole, *found) if each.rejected is not None), whole)
+        part = part if part.pixels is not None else find_part(small, board, grids, part)
+    if part.pixels is not None:
+        return FoundBoard(to_full_size(part.pixels, scale), factor)
+    if part.rejected is not None and (part.other or whole.rejected is None):
+        return FoundBoard(None, reason=part.reason, rejected=to_full_size(part.rejected, scale))
+    return whole
+
+
+def _find_whole(
+    sizes: Sequence[tuple[float, npt.NDArray[np.uint8], Tensor]],
+    board: Board,
+    detectors: Sequence[Callable[[npt.NDArray[np.uint8], Board], Tensor | None]],
+) -> FoundBoard:
+    """The first grid of a detector, at one size after the other, that is the whole board."""
+    missing = FoundBoard(None, reason=f"no board of {board.columns}x{board.rows} inner corners found")
     for factor, small, scale in sizes:
-        for find in (_find_classic, find_sector, _find_shadowed):
+        for find in detectors:
             corners = find(small, board)
             if corners is None:
                 continue
@@ -438,13 +470,20 @@ def find_board(image: npt.NDArray[np.uint8], board: Board) -> FoundBoard:
                 return FoundBoard(to_full_size(canonical_order(small, corners, board), scale), factor)
             if missing.rejected is None:
                 missing = FoundBoard(None, reason=trouble, rejected=to_full_size(corners, scale))
-    factor, small, scale = sizes[0]
-    part = find_part(small, board, seeds(small))
-    if part.pixels is not None:
-        return FoundBoard(to_full_size(part.pixels, scale), factor)
-    if part.rejected is not None and (part.other or missing.rejected is None):
-        return FoundBoard(None, reason=part.reason, rejected=to_full_size(part.rejected, scale))
     return missing
+
+
+def _is_all(image: npt.NDArray[np.uint8], part: BoardPart, board: Board) -> bool:
+    """Whether no detector of whole boards finds more: another board is there, all of this one, or some is outside."""
+    if part.pixels is None:
+        return part.other
+    seen = torch.isfinite(part.pixels).all(-1).numpy()
+    plane, places = board.points[:, :2].numpy() / board.square, part.pixels.numpy()
+    image_from_board, _ = cv2.findHomography(plane[seen], places[seen])
+    if seen.all() or image_from_board is None:
+        return bool(seen.all())
+    there = torch.from_numpy(cv2.perspectiveTransform(plane[None, ~seen], image_from_board)[0])
+    return not bool(in_image(image, there).all())
 
 
 def refine_through_sizes(image: Gray, pixels: Tensor, board: Board, factor: float) -> Tensor:
