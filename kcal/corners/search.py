@@ -433,18 +433,17 @@ def find_board(image: npt.NDArray[np.uint8], board: Board) -> FoundBoard:
     """
     sizes = [(factor, *_reduced_8bit(image, factor)) for factor in _factors(image)]
     factor, small, scale = sizes[0]
-    whole = _find_whole(sizes[:1], board, (_find_classic,))
+    searches = [(size, find) for size in sizes for find in (_find_classic, find_sector, _find_shadowed)]
+    whole = _find_whole(searches[:1], board)
     if whole.pixels is not None:
         return whole
     grids = seeds(small)
     part = find_part(small, board, itertools.islice(grids, 1))
     if not _is_all(small, part, board):
-        others = (find_sector, _find_shadowed)
-        found = [_find_whole(sizes[:1], board, others)]
-        found += [] if found[0].pixels is not None else [_find_whole(sizes[1:], board, (_find_classic, *others))]
-        if found[-1].pixels is not None:
-            return found[-1]
-        whole = next((each for each in (whole, *found) if each.rejected is not None), whole)
+        found = _find_whole(searches[1:], board)
+        if found.pixels is not None:
+            return found
+        whole = found if whole.rejected is None else whole
         part = part if part.pixels is not None else find_part(small, board, grids, part)
     if part.pixels is not None:
         return FoundBoard(to_full_size(part.pixels, scale), factor)
@@ -453,23 +452,22 @@ def find_board(image: npt.NDArray[np.uint8], board: Board) -> FoundBoard:
     return whole
 
 
-def _find_whole(
-    sizes: Sequence[tuple[float, npt.NDArray[np.uint8], Tensor]],
-    board: Board,
-    detectors: Sequence[Callable[[npt.NDArray[np.uint8], Board], Tensor | None]],
-) -> FoundBoard:
-    """The first grid of a detector, at one size after the other, that is the whole board."""
+_Size = tuple[float, npt.NDArray[np.uint8], Tensor]  # how many times smaller, the image, and the exact scale back
+_Search = tuple[_Size, Callable[[npt.NDArray[np.uint8], Board], Tensor | None]]
+
+
+def _find_whole(searches: Sequence[_Search], board: Board) -> FoundBoard:
+    """The first grid that is the whole board, by one detector at one size after the other."""
     missing = FoundBoard(None, reason=f"no board of {board.columns}x{board.rows} inner corners found")
-    for factor, small, scale in sizes:
-        for find in detectors:
-            corners = find(small, board)
-            if corners is None:
-                continue
-            trouble = grid_trouble(small, corners, board.columns, board.rows)
-            if trouble is None:
-                return FoundBoard(to_full_size(canonical_order(small, corners, board), scale), factor)
-            if missing.rejected is None:
-                missing = FoundBoard(None, reason=trouble, rejected=to_full_size(corners, scale))
+    for (factor, small, scale), find in searches:
+        corners = find(small, board)
+        if corners is None:
+            continue
+        trouble = grid_trouble(small, corners, board.columns, board.rows)
+        if trouble is None:
+            return FoundBoard(to_full_size(canonical_order(small, corners, board), scale), factor)
+        if missing.rejected is None:
+            missing = FoundBoard(None, reason=trouble, rejected=to_full_size(corners, scale))
     return missing
 
 

@@ -418,3 +418,34 @@ def test_quarter_turns_lean() -> None:
     assert uprightness(rising) == pytest.approx(math.sqrt(2.0) * (1.0 - 1e-6), abs=1e-9)
     assert uprightness(torch.stack([j, i], -1)) == 2.0
     assert uprightness(torch.stack([-j, -i], -1)) == -2.0
+
+
+@pytest.mark.parametrize(("columns", "rows", "cut"), [(5, 4, 0), (9, 6, 60)])
+def test_other_and_cut_boards_are_told_without_the_slow_detectors(
+    monkeypatch: pytest.MonkeyPatch, columns: int, rows: int, cut: int
+) -> None:
+    def refused(*_: object) -> None:
+        raise AssertionError("the image shows for certain that no whole 9x6 board is there")
+
+    monkeypatch.setattr(search, "find_sector", refused)
+    monkeypatch.setattr(search, "_find_shadowed", refused)
+    y, x = np.mgrid[: 30 * rows + 110, : 30 * columns + 110]
+    on = (x >= 40) & (x < 70 + 30 * columns) & (y >= 40) & (y < 70 + 30 * rows)
+    image = np.where(on & (((x - 40) // 30 + (y - 40) // 30) % 2 == 0), 40, 220).astype(np.uint8)
+    image = cv2.GaussianBlur(image, (0, 0), 0.8)[:, : image.shape[1] - 40 - cut]
+    found = search.find_board(image, Board(columns=9, rows=6, square=0.025))
+    if cut:
+        assert found.pixels is not None
+        assert 36 <= int(torch.isfinite(found.pixels).all(-1).sum()) < 54
+    else:
+        assert found.reason == "a board of 5x4 inner corners was found, not 9x6: give --board 5x4"
+
+
+def test_a_board_of_which_a_corner_is_hidden_is_sought_further() -> None:
+    board = Board(columns=9, rows=6, square=0.025)
+    pixels = 20.0 * board.points[:, :2] / board.square + 40.0
+    image = np.zeros((200, 300), np.uint8)
+    assert search._is_all(image, search.BoardPart(pixels), board)
+    pixels[0] = torch.nan
+    assert not search._is_all(image, search.BoardPart(pixels), board)
+    assert search._is_all(image, search.BoardPart(pixels - 41.0), board)
