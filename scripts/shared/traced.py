@@ -32,9 +32,10 @@ def capture(
     seed: int,
     points: Tensor = BOARD.points,
     fill: tuple[float, float] = (0.25, 0.8),
+    posed_by: LensLike | None = None,
 ) -> Observations:
     """Views of a board, whose corners truly are at `points`, by a lens, as an observations file."""
-    return captures(lens, views, [sigma], seed, points, fill)[0]
+    return captures(lens, views, [sigma], seed, points, fill, posed_by)[0]
 
 
 def captures(
@@ -44,9 +45,10 @@ def captures(
     seed: int,
     points: Tensor = BOARD.points,
     fill: tuple[float, float] = (0.25, 0.8),
+    posed_by: LensLike | None = None,
 ) -> list[Observations]:
-    """The same views with noise of several sizes, each drawn by itself."""
-    found = capture_corners(lens, views, sigma=1.0, seed=seed, fill=fill)
+    """The same views with noise of several sizes, each drawn by itself; `posed_by`: a lens that draws poses sooner."""
+    found = capture_corners(posed_by or lens, views, sigma=1.0, seed=seed, fill=fill)
     seen, valid = lens.project(points @ found.rotation.transpose(-1, -2) + found.translation[:, None])
     out = []
     for k, sigma in enumerate(sigmas):
