@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kcal.lens.camera import Camera
-from scripts.check import aspect, handheld, ordinary
+from scripts.check import aspect, captures_that_move, ordinary
 from scripts.shared.held_out import held_out
 from scripts.shared.mrcal_camera import SplinedCamera
 from scripts.shared.records import finish, read, seeds
@@ -107,7 +107,7 @@ def test_tables_count_what_was_refused_and_said() -> None:
         {"key": ["hand", 8, 2, "default"], "refused": "too few"},
         {"key": ["stand", 8, 2, "default"], "refused": "too few"},
     ]
-    rows = handheld.lines(records)[2:]
+    rows = captures_that_move.lines(records)[2:]
     assert rows[0] == "| 8 | hand | default | 3 | 33.3 % | 90.0 ± 5.0 | 2.000 | 2.236 | 1.000 | 0 % | 0 % |"
     assert "100.0 %" in rows[1]
     said = [

@@ -297,10 +297,9 @@ def _write_extras(folder: Path, name: str, module: kcal.lens.Undistort, options:
     from kcal.io.images import write_png
 
     if options.maps:
-        last = torch.tensor(module.camera.size, dtype=torch.float64)[:, None, None] - 1.0
-        grid = torch.stack([module.grid_x, module.grid_y])
-        _save_array(folder / f"{name}_map.npy", ((grid.double() + 1.0) * 0.5 * last).float())
-        _save_array(folder / f"{name}_grid.npy", grid.movedim(0, -1)[None].float())
+        last = torch.tensor(module.camera.size, dtype=torch.float64) - 1.0
+        _save_array(folder / f"{name}_map.npy", ((module.grid.double() + 1.0) * 0.5 * last).movedim(-1, 0).float())
+        _save_array(folder / f"{name}_grid.npy", module.grid[None].float())
     if options.mask:
         write_png(folder / f"{name}_mask.png", (module.mask.byte() * 255).numpy())
 

@@ -101,7 +101,7 @@ def undistort_maps(
 class Undistort(StatedModule):
     """Resample images as another camera, usually a pinhole, would have taken them.
 
-    Sampling is bilinear, by kornia's `remap` with `align_corners=True`: integer coordinates are pixel centers. Where
+    Sampling is bilinear, as kornia's `remap` with `align_corners=True`: integer coordinates are pixel centers. Where
     the source shows nothing, the image is 0 and the mask False (see `undistort_maps`).
 
     The maps are computed once and kept, for one precision at a time. They are updated when the parameters of a camera
@@ -127,8 +127,7 @@ class Undistort(StatedModule):
         (torch.Size([2, 3, 480, 640]), torch.Size([2, 480, 640]), True)
     """
 
-    grid_x: Tensor
-    grid_y: Tensor
+    grid: Tensor
     mask: Tensor
     rotation: Tensor
     _made_from: Tensor
@@ -148,7 +147,7 @@ class Undistort(StatedModule):
         turn = torch.eye(3) if rotation is None else rotation
         turn = turn if is_differentiated(turn) else turn.detach()
         self.register_buffer("rotation", turn.to(self.camera.params), persistent=rotation is not None)
-        for name, value in zip(("grid_x", "grid_y", "mask"), self._grid(torch.float32), strict=True):
+        for name, value in zip(("grid", "mask"), self._grid(torch.float32), strict=True):
             self.register_buffer(name, value.detach(), persistent=False)
         self.register_buffer("_made_from", self._camera_values(), persistent=False)
 
@@ -168,7 +167,7 @@ class Undistort(StatedModule):
         """
         self._check(image)
         precision = image.dtype if image.dtype in (torch.float32, torch.float64) else torch.float32
-        grid_x, grid_y, mask = self._maps(precision)
+        grid, mask = self._maps(precision)
         try:
             lead = torch.broadcast_shapes(image.shape[:-3], mask.shape[:-2])
         except RuntimeError as error:
@@ -180,10 +179,8 @@ class Undistort(StatedModule):
         if count * channels == 0:
             return image.new_zeros((*lead, channels, *mask.shape[-2:])), mask
         source = image.to(precision).expand(*lead, *image.shape[-3:]).reshape(count, *image.shape[-3:])
-        x, y = (grid.expand(mask.shape).reshape(count, *mask.shape[-2:]) for grid in (grid_x, grid_y))
-        from kornia.geometry.transform import remap  # which takes long to load
-
-        sampled = remap(source, x, y, mode="bilinear", align_corners=True, normalized_coordinates=True)
+        grid = grid.expand(*mask.shape, 2).reshape(count, *mask.shape[-2:], 2)
+        sampled = torch.nn.functional.grid_sample(source, grid, mode="bilinear", align_corners=True)
         if image.dtype in _INTEGERS:
             sampled = sampled.round()
         return sampled.to(image.dtype).reshape(*lead, *sampled.shape[1:]), mask
@@ -211,29 +208,24 @@ class Undistort(StatedModule):
             parts += [*camera.parameters(), *camera.buffers()]
         return torch.cat([part.detach().flatten().to(torch.float64) for part in parts])
 
-    def _maps(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    def _maps(self, precision: torch.dtype) -> tuple[Tensor, Tensor]:
         live = is_differentiated(self) or not (torch.compiler.is_compiling() or may_branch(self.camera.params))
         compiling = torch.compiler.is_compiling()
-        if live or (compiling and self.grid_x.dtype != precision):
+        if live or (compiling and self.grid.dtype != precision):
             return self._grid(precision)
         # Compiled and exported graphs keep their maps, because comparing values would break the graph. In an eager call
         # the comparison takes some microseconds, and a stale map would give a wrong image.
-        if not compiling and (
-            self.grid_x.dtype != precision or not torch.equal(self._made_from, self._camera_values())
-        ):
-            self.grid_x, self.grid_y, self.mask = self._grid(precision)
+        if not compiling and (self.grid.dtype != precision or not torch.equal(self._made_from, self._camera_values())):
+            self.grid, self.mask = self._grid(precision)
             self._made_from = self._camera_values()
-        return self.grid_x, self.grid_y, self.mask
+        return self.grid, self.mask
 
-    def _grid(self, precision: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions for `grid_sample`, -1 and 1 at the centers of the outer pixels, rounded once."""
+    def _grid(self, precision: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Positions (..., H', W', 2) for `grid_sample`, -1 and 1 at the centers of the outer pixels, rounded once."""
         pixels, mask = _source_positions(self.camera, self.new_camera, self.rotation, self.at)
         # One axis at a time: fewer copies of the whole image's positions in float64.
-        x, y = (
-            (2 * part / (size - 1) - 1).to(precision)
-            for part, size in zip(pixels.unbind(-1), self.camera.size, strict=True)
-        )
-        return x.contiguous(), y.contiguous(), mask
+        axes = zip(pixels.unbind(-1), self.camera.size, strict=True)
+        return torch.stack([(2 * part / (size - 1) - 1).to(precision) for part, size in axes], -1), mask
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         def moved(tensor: Tensor) -> Tensor:

@@ -5,9 +5,9 @@
     python -m scripts.check.aspect --out FILE [OTHER ...] --write            # the table of docs/measured/ordinary.md
 
 Captures that FILE has are not made again. Truth: traced lenses in turn and printed boards, as in
-`scripts.check.handheld`; 8 to 20 views, 0.05 to 0.2 px of noise; boards upright (within 2 degrees) in half of the
-captures, turned by up to 90 degrees in the others; a quarter of the captures by hand. A camera is said to have pixels
-that are not square if a warning of its calibration contains "pixels are not square".
+`scripts.check.captures_that_move`; 8 to 20 views, 0.05 to 0.2 px of noise; boards upright (within 2 degrees) in half
+of the captures, turned by up to 90 degrees in the others; a quarter of the captures by hand. A camera is said to have
+pixels that are not square if a warning of its calibration contains "pixels are not square".
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import moving_residuals
 from kcal.sim.captures import BoardLike, BoardSize, PrintedBoard
-from scripts.check.handheld import rms, share
+from scripts.check.captures_that_move import rms, share
 from scripts.shared.page import table, tell
 from scripts.shared.real_captures import data_folder, load
 from scripts.shared.records import Record, finish, read, seeds

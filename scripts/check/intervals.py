@@ -7,9 +7,10 @@
 
 Calibrations that FILE has are not made again, so that a run can be interrupted, and split over several files.
 
-Captures are those of `scripts.check.handheld`: three traced lenses in turn, printed boards, noise of 0.08 px; 5, 8, 12
-and 20 views in turn, every other one by hand. Each is calibrated with the default lens, whose intervals should be true,
-and with opencv5, which describes neither lens nor board, so that they should not. A second capture of the same lens
+Captures are those of `scripts.check.captures_that_move`: three traced lenses in turn, printed boards, noise of
+0.08 px; 5, 8, 12 and 20 views in turn, every other one by hand. Each is calibrated with the default lens, whose
+intervals should be true, and with opencv5, which describes neither lens nor board, so that they should not. A second
+capture of the same lens
 and board, with as many views, is what `--against` gets. Truth: the share of the image in which the true lens lies in
 the stated 95 % ellipses, at infinity after the best-fit rotation. Intervals count as true where it is more than half:
 places of one calibration go together, so that true intervals have all of the image inside or, seldom, little of it.

@@ -49,6 +49,7 @@ def simulated(
     bent: float = 0.0,
     share: float = 1.0,
     board: BoardLike | None = None,
+    shifts: Tensor | None = None,
 ) -> Simulated:
     """Draw a lens, a printed board and views of it; lens and what is held follow from the seed in turn.
 
@@ -63,6 +64,7 @@ def simulated(
         bent: meters by which the board bends about an axis of its own in each view (standard deviation).
         share: of the views in which it does; in the others it is stiff.
         board: with the corners of `BOARD`, in place of an ordinary print.
+        shifts: (V, 2) or more, pixels by which a stabilizer shifts the image of each view.
     """
     lens = drawn_lens(PRESCRIPTIONS[LENSES[seed % len(LENSES)]], 1.0, seed, wander=1.0)
     hands = Hands(holds="camera" if seed // len(LENSES) % 2 else "board") if by_hand else None
@@ -73,15 +75,16 @@ def simulated(
     truth = moving_capture(
         lens, poses, sigma=sigma, seed=1000 + seed + 10**6 * take, hands=hands, board=board, heights=heights
     )
-    seen = truth.pixels.isfinite().all(-1) & lens.inside(truth.pixels.nan_to_num(nan=-9.0))
-    pixels = torch.where(seen[..., None], truth.pixels, torch.nan)
+    pixels = truth.pixels if shifts is None else truth.pixels + shifts[:views, None]
+    seen = pixels.isfinite().all(-1) & lens.inside(pixels.nan_to_num(nan=-9.0))
+    pixels = torch.where(seen[..., None], pixels, torch.nan)
     return Simulated(lens, stretched(pixels, truth.covariance, lens.size, stretch), truth)
 
 
-def bends(views: int, size: float, share: float, generator: torch.Generator) -> Tensor:
-    """(V, N) heights of `BOARD` that bends in some views: along one direction of its own, more on one side."""
-    low, high = BOARD.points[:, :2].amin(0), BOARD.points[:, :2].amax(0)
-    flat = (2.0 * BOARD.points[:, :2] - low - high) / (high - low).max()
+def bends(views: int, size: float, share: float, generator: torch.Generator, board: Board = BOARD) -> Tensor:
+    """(V, N) heights of a board that bends in some views: along one direction of its own, more on one side."""
+    low, high = board.points[:, :2].amin(0), board.points[:, :2].amax(0)
+    flat = (2.0 * board.points[:, :2] - low - high) / (high - low).max()
     angle, chosen = torch.rand(2, views, dtype=torch.float64, generator=generator)
     height, skewed = torch.randn(2, views, 1, dtype=torch.float64, generator=generator)
     across = torch.stack([torch.cos(math.pi * angle), torch.sin(math.pi * angle)], -1) @ flat.T
@@ -139,14 +142,34 @@ def default_options(**switched: bool) -> CalibrationOptions:
     return CalibrationOptions(**switched)  # type: ignore[arg-type, unused-ignore]
 
 
-def against_truth(case: Simulated, options: CalibrationOptions) -> Record:
-    """Calibrate, and compare with the true lens all over the image, at infinity."""
+class Shifted(NamedTuple):
+    """A lens before a stabilizer that shifts its image by (2,) pixels."""
+
+    lens: TruthLens
+    by: Tensor
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Of the image, pixels."""
+        return self.lens.size
+
+    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """As a lens does."""
+        return self.lens.unproject(pixels - self.by)
+
+
+def against_truth(case: Simulated, options: CalibrationOptions, shift: Tensor | None = None) -> Record:
+    """Calibrate, and compare with the true lens all over the image, at infinity; also in a frame with this shift."""
     try:
         result = calibrate_camera(case.seen, options)
         error = error_at_infinity(result.camera, case.lens)
+        found = told(result) | figures(result, case, error.pixels, error.errors)
+        if shift is not None:
+            frame = error_at_infinity(result.camera, Shifted(case.lens, shift))  # type: ignore[arg-type]
+            found["frame"] = figures(result, case, frame.pixels, frame.errors)["everywhere"]
     except KcalError as refusal:
         return {"refused": str(refusal)}
-    return told(result) | figures(result, case, error.pixels, error.errors) | {"rms": error.rms, "valid": error.valid}
+    return found | {"rms": error.rms, "valid": error.valid}
 
 
 def told(result: CameraCalibrationResult) -> Record:
@@ -156,7 +179,15 @@ def told(result: CameraCalibrationResult) -> Record:
         "warnings": list(result.warnings),
         "tempering": None if result.hybrid is None else result.hybrid.tempering,
         "terms": [] if result.hybrid is None else terms(result.hybrid),
+        "causes": causes(result),
     }
+
+
+def causes(result: CameraCalibrationResult) -> list[str]:
+    """Which causes a result names: a lens that moves, a board that bends, motion, or views that are unlike others."""
+    names = {finding.name for finding in result.findings}
+    named = {"lens": "moving-lens", "bending": "bending", "motion": "motion"}
+    return [cause for cause, name in named.items() if name in names] + ["views"] * bool(result.rejected_views)
 
 
 def terms(fit: HybridFit) -> list[str]:

@@ -202,7 +202,7 @@ class TestModule:
             assert out.dtype == kind
             # The ramp itself is rounded on the way in and out. Positions rounded to 11 bits would err by up to 0.15 px.
             assert (out.double() - full).abs().max() < 2 * torch.finfo(kind).eps
-        assert undistort.grid_x.dtype == torch.float32
+        assert undistort.grid.dtype == torch.float32
         assert undistort.camera.params.dtype == F64
 
     def test_maps_follow_the_parameters(self) -> None:
@@ -271,9 +271,9 @@ class TestGradients:
     def test_frozen_cameras_keep_their_maps(self) -> None:
         undistort = Undistort(copy.deepcopy(SMALL))
         image = torch.rand(1, 6, 7, requires_grad=True)
-        kept = undistort.grid_x
+        kept = undistort.grid
         undistort(image)[0].sum().backward()
-        assert undistort.grid_x is kept
+        assert undistort.grid is kept
         assert image.grad is not None
         undistort.requires_grad_(True)
         undistort(image)[0].sum().backward()

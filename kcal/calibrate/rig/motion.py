@@ -329,5 +329,8 @@ def scatter_findings(focal: Sequence[float], motions: Sequence[BoardMotion | Non
         "of a corner: were both views of each pair taken at the same moment, of a board at rest? Each pair counts with "
         "such an error, and the covariance allows for it"
     )
-    action = "trigger the cameras together, or put the board on a stand (if nothing moved, a camera is wrong)"
+    action = (
+        "trigger the cameras together, or put the board on a stand (if nothing moved, a camera is wrong, or a "
+        "stabilizer shifts each image, and ranges of other frames err by as much: switch it off)"
+    )
     return [Finding("synchronization", "doubt", text, action)]

@@ -1,0 +1,321 @@
+"""Captures by hand, with a stabilizer, of boards that bend, and pairs that are not simultaneous: do error bars hold?
+
+    python -m scripts.check.captures_that_move --out FILE --seeds 0-99                    # 8 views, by hand, on a stand
+    python -m scripts.check.captures_that_move --out FILE --seeds 0-199 --views 3 4 5 6   # few views
+    python -m scripts.check.captures_that_move --out FILE --seeds 0-99 --fit still        # without the terms for motion
+    python -m scripts.check.captures_that_move --out FILE --seeds 0-39 --views 16 --kinds all      # all that move
+    python -m scripts.check.captures_that_move --out FILE --seeds 0-39 --rigs --kinds all          # rigs of the same
+    python -m scripts.check.captures_that_move --out FILE [OTHER ...] --write             # the tables in docs/measured
+
+Captures that FILE has are not made again, so that a run can be interrupted, and split over several files.
+
+Truth: three traced lenses in turn, decentered, whose entrance pupils move; printed boards (7 x 6 corners, 5 cm), noise
+of 0.08 px. By hand (`scripts.shared.moving_captures`): the camera or the board is held, in turn; a rolling shutter with
+a readout of 10 to 30 ms; rates of 0.1 to 1 rad/s and 0.05 to 0.3 m/s (standard deviation along each axis, drawn for
+each capture), half of their variance tremor of 2 to 10 Hz; exposures of 5 to 20 ms, pictures with more than 12 px of
+blur taken again; noise grows along the blur, as the views' covariances say. Optical stabilizer: the image of each view
+is shifted as a whole (standard deviation along each axis); electronic: so too, by hand. Measure: as in
+`scripts.bench.traced_lenses`, where the camera sees infinitely distant points, all over the image, after the best
+turn; of the camera without a shift, and of that of another frame, with a shift of its own.
+
+Rigs: two cameras of 1280 x 960 pixels, 25 cm apart, which see twelve boards (9 x 6 corners, 5 cm); noise of 0.1 px;
+hands for each camera its own. The cameras are exact, or calibrated from their sides of the pairs where these have a
+stabilizer or bend. *Apart*: the board moves on, at rates as by hand, until the right camera exposes. Measure: the
+error of the relative pose (six numbers) in units of its covariance, squared and divided by six, which is one on the
+average, and the errors themselves, of exact cameras; and whether the range of a point 30 m away, marked exactly
+in the middle of one frame of each, lies in its 95 % interval: the relative yaw decides it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import statistics
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcal import Board, Camera, KcalError, Localizer, Observations, RigOptions, calibrate_camera, calibrate_rig
+from kcal.lens import rotation_from_vector, vector_from_rotation
+from kcal.lens.pose import Pose
+from kcal.sim.captures import BoardSize, sample_board_poses
+from scripts.shared.moving_captures import Hands, MovingCapture, draw_motion, moving_capture
+from scripts.shared.page import table, write_section
+from scripts.shared.records import Record, finish, read, seeds
+from scripts.shared.simulated import against_truth, bends, default_options, simulated, view_of
+from scripts.shared.timing import show
+
+PAGE = "ordinary.md"
+SIGMA = 0.08
+TERMS = ("motion", "bending")
+
+
+class Kind(NamedTuple):
+    """What moves while views are taken.
+
+    Attributes:
+        by_hand: the camera or the board is held by hand, before a rolling shutter.
+        bent: meters by which the board bends (standard deviation).
+        share: of the views in which it does.
+        shift: pixels by which each image is shifted along each axis (standard deviation).
+        apart: seconds between the exposures of a rig's cameras.
+    """
+
+    by_hand: bool = False
+    bent: float = 0.0
+    share: float = 1.0
+    shift: float = 0.0
+    apart: float = 0.0
+
+
+KINDS = {
+    "hand": Kind(True),
+    "stand": Kind(),
+    "bent": Kind(bent=1e-3),
+    "few bent": Kind(bent=3e-3, share=0.2),
+    "bent, hand": Kind(True, bent=1e-3),
+    "bent by 0.1 mm": Kind(bent=1e-4),
+    "bent by 0.5 mm": Kind(bent=5e-4),
+    "paper, bent by 2 mm, hand": Kind(True, bent=2e-3),
+    **{f"optical stabilizer, {px} px": Kind(shift=px) for px in (2, 5, 15)},
+    **{f"electronic stabilizer, {px} px": Kind(True, shift=px) for px in (2, 5, 15)},
+    **{f"{apart:g} s apart, hand": Kind(True, apart=apart) for apart in (0.01, 0.03, 0.1)},
+}
+# Of a table of its own, each with the cause to be named.
+MOVING = {
+    name: "lens" if kind.shift else "bending" if kind.bent else "moment" if kind.apart else ""
+    for name, kind in KINDS.items()
+    if name not in ("bent", "few bent", "bent, hand")
+}
+FITS = {"default": {}, "still": {"motion": False}, "stiff": {"bending": False}}
+# Of rigs.
+RIG_BOARD, RIG_SIZE = Board(columns=9, rows=6, square=0.05), BoardSize(9, 6, 0.05)
+CAMERA = Camera.build(focal=(1100, 1100), center=(639.5, 479.5), size=(1280, 960), coefficients=[-0.1])
+TURN = rotation_from_vector(torch.tensor([0.0, -0.15, 0.0], dtype=torch.float64))
+SHIFT = torch.tensor([-0.25, 0.0, 0.0], dtype=torch.float64)
+BOARDS, RIG_SIGMA, FEWEST = 12, 0.1, 12
+FAR = torch.tensor([[0.0, 0.0, 30.0]], dtype=torch.float64)  # m
+# Squared distance that a normal vector of six components exceeds once in twenty times.
+CHI2_OF_SIX = 12.592
+
+
+def shifts(kind: Kind, count: int, seed: int) -> Tensor:
+    """(count, 2) pixels by which images are shifted."""
+    generator = torch.Generator().manual_seed(70_000 + seed)
+    return kind.shift * torch.randn((count, 2), dtype=torch.float64, generator=generator)
+
+
+def captured(kind: str, views: int, seed: int, fit: str) -> Record:
+    """One capture and its calibration."""
+    what = KINDS[kind]
+    by_view = shifts(what, views + 1, seed) if what.shift else None
+    case = simulated(seed, views, SIGMA, what.by_hand, bent=what.bent, share=what.share, shifts=by_view)
+    start = time.process_time()
+    found = against_truth(case, default_options(**FITS[fit]), None if by_view is None else by_view[-1])
+    spent = time.process_time() - start
+    moved = {name: getattr(case.truth, name) for name in ("readout", "exposure", "turning", "speed")}
+    return found | moved | {"cpu_s": spent, "blur": float(case.truth.blur.norm(dim=-1).square().nanmean().sqrt())}
+
+
+def rig(kind: str, seed: int, fit: str) -> Record:
+    """One rig, from the pairs of its two cameras."""
+    what, generator = KINDS[kind], torch.Generator().manual_seed(seed)
+    poses = sample_board_poses(CAMERA, RIG_SIZE, BOARDS, generator, fill=(0.25, 0.5))
+    there = [later(pose, what.apart, generator) for pose in poses] if what.apart else poses
+    other = [Pose(TURN @ pose.rotation, TURN @ pose.translation + SHIFT) for pose in there]
+    hands = Hands() if what.by_hand else None
+    heights = bends(BOARDS, what.bent, what.share, generator, RIG_BOARD) if what.bent else None
+    sides = [
+        moving_capture(CAMERA, own, sigma=RIG_SIGMA, seed=2 * seed + k, hands=hands, board=RIG_SIZE, heights=heights)
+        for k, own in enumerate((poses, other))
+    ]
+    by_view = [shifts(what, BOARDS + 1, 2 * seed + k)[:, None] for k in range(2)]
+    shown = [side.pixels + own[:-1] for side, own in zip(sides, by_view, strict=True)]
+    seen = [CAMERA.inside(pixels) & pixels.isfinite().all(-1) for pixels in shown]
+    kept = (torch.stack(seen).sum(-1) >= FEWEST).all(0).nonzero()[:, 0].tolist()
+    both = [observed(*one, kept) for one in zip(shown, sides, seen, strict=True)]
+    pairs = [(str(i), str(i)) for i in kept]
+    try:
+        left, right = (calibrate_camera(one).camera if what.shift or what.bent else CAMERA for one in both)
+        result = calibrate_rig(left, right, both[0], both[1], pairs, RigOptions(motion=fit != "still"))
+        found = result.stereo()
+        marks = [
+            CAMERA.project(points)[0] + own[-1]
+            for points, own in zip((FAR, FAR @ TURN.T + SHIFT), by_view, strict=True)
+        ]
+        place = Localizer(found, pixel_sigma=1e-3)(*marks)
+    except KcalError as refusal:
+        return {"refused": str(refusal)}
+    turn = vector_from_rotation(found.right_from_left_rotation @ TURN.T)
+    shift = found.right_from_left_translation - SHIFT
+    error, length = torch.cat([turn, shift]), float(FAR.norm())
+    square = float(error @ torch.linalg.solve(result.relative_covariance(), error))
+    inside = bool((place.range_low <= length) & ~(place.range_high < length))
+    said = {
+        "names": [finding.name for finding in result.findings],
+        "low": float(place.range_low),
+        "high": float(place.range_high),
+    }
+    return {"chi2": square, "mrad": 1e3 * float(turn.norm()), "mm": 1e3 * float(shift.norm()), "yaw": inside} | said
+
+
+def later(pose: Pose, seconds: float, generator: torch.Generator) -> Pose:
+    """A board that moves by hand about its middle, after so many seconds."""
+    hands = Hands()
+    low, high = torch.tensor([hands.turning, hands.speed], dtype=torch.float64).log().T
+    turning, speed = (low + (high - low) * torch.rand(2, dtype=torch.float64, generator=generator)).exp().tolist()
+    step = draw_motion(turning, speed, hands.tremor, generator).at(torch.tensor(seconds, dtype=torch.float64))
+    turn, middle = rotation_from_vector(step[:3]), pose.rotation @ RIG_BOARD.points.mean(0) + pose.translation
+    return Pose(turn @ pose.rotation, turn @ (pose.translation - middle) + middle + step[3:])
+
+
+def observed(pixels: Tensor, side: MovingCapture, inside: Tensor, kept: list[int]) -> Observations:
+    """What one camera saw of the boards that both saw, with the corners' covariances."""
+    pixels = torch.where(inside[..., None], pixels, torch.nan)
+    views = tuple(view_of(str(i), pixels[i], side.covariance[i]) for i in kept)
+    return Observations(board=RIG_BOARD, image_size=CAMERA.size, views=views)
+
+
+def line(record: Record) -> str:
+    """One line to print."""
+    if "refused" in record:
+        return f"refused: {record['refused'][:90]}"
+    if "chi2" in record:
+        return f"χ²/6 {record['chi2'] / 6:.2f}, {record['mrad']:.3f} mrad, {record['mm']:.3f} mm, yaw {record['yaw']}"
+    return (
+        f"error {record['rms']:.3f} px, stated {record['predicted']:.3f}, {100 * record['everywhere']:.0f} % in the "
+        f"ellipses, {', '.join(record['causes']) or 'nothing named'}, {record['cpu_s']:.1f} s"
+    )
+
+
+def share(records: list[Record], key: str) -> str:
+    """Mean of a share in percent, with its standard error; captures count alike, for the places of one go together."""
+    values = [100.0 * record[key] for record in records if math.isfinite(record[key])]
+    if len(values) < 2:
+        return "–"
+    return f"{statistics.fmean(values):.1f} ± {statistics.stdev(values) / math.sqrt(len(values)):.1f}"
+
+
+def rms(values: list[float]) -> float:
+    return math.sqrt(statistics.fmean(value**2 for value in values))
+
+
+def lines(records: list[Record]) -> list[str]:
+    """One row for each number of views, kind and fit."""
+    cells: dict[tuple[int, str, str], list[Record]] = {}
+    for record in records:
+        kind, views, _, fit = record["key"]
+        cells.setdefault((views, kind, fit), []).append(record)
+    rows = []
+    for (views, kind, fit), own in sorted(cells.items()):
+        known = [record for record in own if "refused" not in record]
+        refused = f"{100 * (1 - len(known) / len(own)):.1f} %"
+        if not known:
+            rows.append([views, kind, fit, len(own), refused, *["–"] * 6])
+            continue
+        true, stated = [r["rms"] for r in known], [r["predicted"] for r in known]
+        rows.append(
+            [
+                views, kind, fit, len(own), refused, share(known, "everywhere"),
+                f"{statistics.median(true):.3f}", f"{rms(true):.3f}", f"{rms(stated):.3f}",
+                *(f"{100 * statistics.fmean(term in r.get('terms', ()) for r in known):.0f} %" for term in TERMS),
+            ]
+        )  # fmt: skip
+    head = [
+        "views", "held by", "fit", "captures", "refused", "in 95 %, whole image", "median error, px",
+        "RMS error", "RMS stated", "motion found", "bending found",
+    ]  # fmt: skip
+    return table(head, rows)
+
+
+def moving_lines(records: list[Record]) -> list[str]:
+    """One row for each kind: what was named, and what error bars contain."""
+    rows = []
+    for kind in MOVING:
+        own = [r for r in records if r["key"][0] == kind and r["key"][-1] == "default"]
+        views, pairs = ([r for r in own if len(r["key"]) == size] for size in (4, 3))
+        if not own:
+            continue
+        known, rigs = ([r for r in part if "refused" not in r] for part in (views, pairs))
+        named = [
+            f"{100 * statistics.fmean(cause in r['causes'] for r in known):.0f} %" if known else "–"
+            for cause in ("lens", "bending", "motion", "views")
+        ]
+        moment = f"{100 * statistics.fmean('synchronization' in r['names'] for r in rigs):.0f} %" if rigs else "–"
+        yaw = f"{100 * statistics.fmean(r['yaw'] for r in rigs):.0f} %" if rigs else "–"
+        frames = share([r for r in known if "frame" in r], "frame")
+        rows.append(
+            [
+                kind, f"{len(views)} / {len(pairs)}", f"{len(views) - len(known)} / {len(pairs) - len(rigs)}",
+                *named, moment, share(known, "everywhere"), frames, yaw,
+            ]
+        )  # fmt: skip
+    head = [
+        "what moves", "captures / rigs", "refused", "lens named", "bending", "motion", "other views", "other moments",
+        "mean camera in 95 %", "another frame's", "range of a rig in 95 %",
+    ]  # fmt: skip
+    return table(head, rows)
+
+
+def rig_lines(records: list[Record]) -> list[str]:
+    """One row for boards by hand and on a stand, with and without motion."""
+    rows = []
+    for held_by, fit in itertools.product(("hand", "stand"), ("default", "still")):
+        own = [record for record in records if (record["key"][0], record["key"][2]) == (held_by, fit)]
+        known = [record for record in own if "refused" not in record]
+        if known:
+            inside = 100.0 * statistics.fmean(record["chi2"] < CHI2_OF_SIX for record in known)
+            mean = statistics.fmean(record["chi2"] / 6 for record in known)
+            errors = [rms([record[key] for record in known]) for key in ("mrad", "mm")]
+            refused = len(own) - len(known)
+            rows.append(
+                [held_by, fit, len(own), refused, f"{mean:.2f}", f"{inside:.0f} %", *(f"{e:.3f}" for e in errors)]
+            )
+    head = ["held by", "fit", "rigs", "refused", "χ²/6", "in 95 %", "RMS error of rotation, mrad", "of position, mm"]
+    return table(head, rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", nargs="+", type=Path, required=True, help="JSON lines; the first is written to")
+    parser.add_argument("--seeds", type=seeds, help="for example 0-99")
+    parser.add_argument("--views", nargs="+", type=int, default=[8])
+    parser.add_argument("--kinds", nargs="+", choices=[*KINDS, "all"], default=["hand", "stand"])
+    parser.add_argument("--rigs", action="store_true", help="rigs from pairs, in place of captures")
+    parser.add_argument("--fit", choices=FITS, default="default", help="still: no motion; stiff: no bending")
+    parser.add_argument("--write", action="store_true", help="write the tables into the page")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    if arguments.seeds is not None:
+        default_options(**FITS[arguments.fit])
+        kinds = list(MOVING) if "all" in arguments.kinds else arguments.kinds
+        if arguments.rigs:
+            keys = [(k, s, arguments.fit) for s, k in itertools.product(arguments.seeds, kinds)]
+            finish(arguments.out[0], keys, rig, line)
+        else:
+            kinds = [kind for kind in kinds if not KINDS[kind].apart]
+            each = itertools.product(arguments.seeds, arguments.views, kinds)
+            finish(arguments.out[0], [(k, n, s, arguments.fit) for s, n, k in each], captured, line)
+    records = read(arguments.out)
+    rigs = [record for record in records if len(record["key"]) == 3]
+    views = [record for record in records if len(record["key"]) == 4]
+    held = [record for record in views if record["key"][0] in ("hand", "stand")]
+    bent = [record for record in views if record["key"][0] in ("bent", "few bent", "bent, hand")]
+    sections = {
+        "handheld": (held, lines),
+        "bent": (bent, lines),
+        "rigs": (rigs, rig_lines),
+        "moving": (records, moving_lines),
+    }
+    for section, (own, told) in sections.items():
+        text = show(told(own)) if own else []
+        if arguments.write and own:
+            write_section(PAGE, section, text)
+
+
+if __name__ == "__main__":
+    main()
