@@ -38,6 +38,7 @@ KINDS = {
     "pairs": ("number of pairs", "rig", "relative pose"), "swapped": ("exchanged", "rig", "relative pose"),
     "moved": ("motion of boards", "", "relative pose"),
     "rig": ("warning when it was solved", "", "relative pose"),
+    "ranges": ("known ranges", "", "relative pose"),
     "contradiction": ("contradiction", "rig", "relative pose"), "left-out": ("left out", "", "relative pose"),
 }  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""`kcal check`: are the error bars of a camera true at my site?"""
+"""`kcal check`: are the error bars of a camera or a rig true at my site?"""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ import typer
 import kcal
 from kcal.cli import kinds
 from kcal.cli.console import err, out, print_answer, print_wrote, steps, tell, tell_table, warn
+from kcal.cli.inputs import pixel_sigma_and_source
 from kcal.cli.options import Kind, Several
 from kcal.cli.report import NO, calibrated_again
 from kcal.cli.rig_sources import check_views_of
 from kcal.errors import FileError, InputError
+from kcal.file_kind import file_kind
 from kcal.files import check_writable, read_bytes, write_atomic
 from kcal.table import Table
 
@@ -34,8 +36,11 @@ _OFTEN = 5.0
 
 
 def check_command(
-    camera: kinds.CalibratedCamera,
+    camera: kinds.CalibratedOrRig,
     *,
+    ranges: kinds.Table | None = None,
+    marks: kinds.Marks | None = None,
+    pixel_sigma: kinds.PixelSigma | None = None,
     observations: kinds.Observed | None = None,
     distance: Several[kinds.Distance] | None = None,
     against: kinds.Observed | None = None,
@@ -43,9 +48,12 @@ def check_command(
     picture: kinds.Picture | None = None,
     output: kinds.Output | None = None,
 ) -> None:
-    """Are the error bars of a camera true, here and at my ranges? Yes or no.
+    """Are the error bars of a camera or a rig true, here and at my ranges? Yes or no.
 
-    Simulates the camera's own capture again and again: its poses, corners, noise and motion, with true cameras and
+    Of a rig: points whose ranges you know (--ranges) are located, and all errors are compared jointly with what the rig
+    states. If they contradict it, yaw, scale or noise is named, whichever explains them best.
+
+    Of a camera: simulates its own capture again and again: its poses, corners, noise and motion, with true cameras and
     boards drawn from what the calibration leaves open. Each is calibrated, and its error is compared with what the
     camera file states, over the image and at each range. A hundred take about a minute.
 
@@ -64,8 +72,13 @@ def check_command(
 
     `kcal check left.camera.json --against december.obs.json`
 
+    `kcal check rig.json --ranges known.csv`
+
     Args:
-        camera: Camera file from `kcal calibrate`.
+        camera: Camera file from `kcal calibrate`, or rig file from `kcal rig`.
+        ranges: Of a rig: known ranges in meters from the left camera, and their standard deviations
+            (name,left_u,left_v,right_u,right_v,range,range_sigma).
+        marks: Where the pixels of --ranges are, by name, if they are not in the same table.
         observations: What it was calibrated from; found beside the camera if not given.
         distance: Of what you look at, one or more: 800, 5km, inf. Far away if not given.
         against: A second capture of this camera: is it where the first one says?
@@ -73,6 +86,14 @@ def check_command(
         picture: map of where the intervals are right.
         output: File of the refits that are done (.npz); CAMERA.check.npz if not given.
     """
+    of_camera = observations, distance, against, picture, output
+    if file_kind(camera) == "rig":
+        if ranges is None or any(of_camera):
+            raise InputError("a rig is checked against known ranges, --ranges, without options that are of a camera")
+        _check_ranges(camera, ranges, marks, pixel_sigma)
+        return
+    if ranges or marks or pixel_sigma:
+        raise InputError("--ranges, --marks and --pixel-sigma are of a rig; give a rig file from kcal rig")
     name = camera.name.removesuffix(".json").removesuffix(".camera")
     kept = check_writable(output or camera.with_name(f"{name}.check.npz"), camera)
 
@@ -100,6 +121,35 @@ def check_command(
         err.print(f"interrupted after {len(done)} of {refits} refits; the same command continues", markup=False)
         raise typer.Exit(_INTERRUPTED)
     if not fine:
+        raise typer.Exit(NO)
+
+
+def _check_ranges(path: Path, ranges: Path, marks: Path | None, sigma: float | None) -> None:
+    """Print known and measured ranges, and whether they agree."""
+    from kcal.io.rig_file import load_pair
+    from kcal.locate.range_check import check_ranges, read_known_ranges
+
+    rig, points = load_pair(path), read_known_ranges(ranges, marks)
+    noise, note = pixel_sigma_and_source(sigma, rig)
+    found = check_ranges(rig, points.marks, points.ranges, points.sigmas, pixel_sigma=noise)
+    columns = {
+        "name": "point", "known_m": "known m", "sigma_m": "±", "measured_m": "measured m", "low_m": "low",
+        "high_m": "high", "pull": "error / σ",
+    }  # fmt: skip
+    numbers = (found.known, points.sigmas, found.measured, found.low, found.high, found.pulls)
+    rows = [
+        [name, *((value, f"{value:.4g}") for value in values[:-1]), (values[-1], f"{values[-1]:+.2f}")]
+        for name, *values in zip(found.names, *(column.tolist() for column in numbers), strict=True)
+    ]
+    tell_table("ranges", Table(columns, rows))
+    if note and points.marks.covariance is None:
+        out.print(note, markup=False)
+    print_answer(found.true, found.text)
+    tell(
+        true=found.true, chi2=found.chi2, points=len(rows), probability=found.probability,
+        causes=[cause._asdict() for cause in found.causes], findings=[one.content() for one in found.findings],
+    )  # fmt: skip
+    if not found.true:
         raise typer.Exit(NO)
 
 

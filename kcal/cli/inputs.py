@@ -137,6 +137,9 @@ CAMERA = Wanted(
 )  # fmt: skip
 # A rig is solved from cameras as they were calibrated, not from those that another solution has refined.
 CALIBRATED = dataclasses.replace(CAMERA, part=False)
+CALIBRATED_OR_RIG = dataclasses.replace(
+    CALIBRATED, words="a kcal camera or rig file", kinds=frozenset({"camera", "rig"})
+)
 # A camera in a file of any program, or one of a rig.
 ANY_CAMERA = dataclasses.replace(
     CAMERA,

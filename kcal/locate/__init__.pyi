@@ -29,3 +29,4 @@ from kcal.locate.tabulate import find_geoid as find_geoid
 # Range errors of a rig
 from kcal.locate.budget import range_errors as range_errors
 from kcal.locate.budget import BudgetErrors as BudgetErrors
+from kcal.locate.range_check import check_ranges as check_ranges
