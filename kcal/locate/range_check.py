@@ -177,7 +177,7 @@ def check_ranges(
     # What marks, known ranges and the rig do to it.
     noise = found.variance * found.fit.covariance[5] / unit.square()
     own = (sigmas / ranges.square()).square()
-    effect = calibration_effect(found.fit, found.scale, _steps(rig))[2].mT / unit[:, None]
+    effect = calibration_effect(found.fit, found.scale, _rig_errors(rig))[2].mT / unit[:, None]
     shared, slopes = effect[:, :-2], dict(zip(("yaw", "scale"), effect[:, -2:].T, strict=True))
 
     def covariance(times: Tensor) -> Tensor:
@@ -214,7 +214,7 @@ def check_ranges(
     )  # fmt: skip
 
 
-def _steps(rig: Rig) -> Tensor:
+def _rig_errors(rig: Rig) -> Tensor:
     """(P, K + 2) what errors of a rig change in its parameters: K that it states, a turn by 1°, a longer baseline."""
     stated = rig.covariance.half.T if rig.covariance else rig.center.new_zeros(sum(rig.sizes) + 6, 0)
     shift, right = rig.right_from_left_translation, rig.right_from_left_rotation
@@ -296,7 +296,7 @@ def read_known_ranges(path: str | Path, marks: str | Path | None = None) -> Know
         path, _HEADER, ("name", *PIXELS, *_COLUMNS, "note"), (*(PIXELS if marks is None else ("name",)), *_COLUMNS)
     )
     names = tuple(row.name for row in rows)
-    known = torch.tensor([[_meters(row, column) for column in _COLUMNS] for row in rows], dtype=torch.float64)
+    known = torch.tensor([[_known_meters(row, column) for column in _COLUMNS] for row in rows], dtype=torch.float64)
     if marks is None:
         pixels = torch.tensor([[pixel_of(row, side, False) for side in PAIR] for row in rows], dtype=torch.float64)
         return KnownRanges(Marks(names, pixels), *known.T)
@@ -310,7 +310,7 @@ def read_known_ranges(path: str | Path, marks: str | Path | None = None) -> Know
     return KnownRanges(Marks(names, found.pixels[which], covariance, sigma), *known.T)
 
 
-def _meters(row: TableRow, column: str) -> float:
+def _known_meters(row: TableRow, column: str) -> float:
     if row.number(column, "a number of meters") <= 0:
         raise FileError(f"{row.where}: {column} is {row.cells[column]!r}; a positive number of meters is needed")
     return float(row.cells[column])
