@@ -81,6 +81,7 @@ class Fit:
 
     @property
     def sigma(self) -> float:
+        """Pixels of noise that are left."""
         return math.sqrt(float(self.off.square().sum()) / (len(self.off) - len(self.step)))
 
 
