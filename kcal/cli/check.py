@@ -92,8 +92,8 @@ def check_command(
             raise InputError("a rig is checked against known ranges, --ranges, without options that are of a camera")
         _check_ranges(camera, ranges, marks, pixel_sigma)
         return
-    if ranges or marks or pixel_sigma:
-        raise InputError("--ranges, --marks and --pixel-sigma are of a rig; give a rig file from kcal rig")
+    if ranges or marks:
+        raise InputError("--ranges and --marks are of a rig; give a rig file from kcal rig")
     name = camera.name.removesuffix(".json").removesuffix(".camera")
     kept = check_writable(output or camera.with_name(f"{name}.check.npz"), camera)
 

@@ -286,7 +286,7 @@ def test_which_commands_take_a_setting() -> None:
     assert {key: takers(found, key) for key in EXAMPLE} == {
         "board": boards, "square": boards, "source": {"capture"}, "require": judging,
         "site": {"locate", "live"}, "heading": {"locate", "live"}, "baseline": {"calibrate", "report", "budget"},
-        "pixel_sigma": {*judging, "rig check", "mark", "locate", "live", "budget", "station", "sites"},
+        "pixel_sigma": {*judging, "check", "rig check", "mark", "locate", "live", "budget", "station", "sites"},
     }  # fmt: skip
 
 
