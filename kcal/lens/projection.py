@@ -273,7 +273,7 @@ def about_axis(
 
 def ray_starts(
     X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, meter: Tensor | float = 1.0, *, port: bool = False
-) -> tuple[Tensor, Pupil]:
+) -> Pupil:
     """Find where the rays to points start, for a hybrid lens (..., P): depth and found, (..., N), and on which axis.
 
     Points and depth are in units of which a meter is `meter` (..., N). At infinity that is 0, and the pupil stays.

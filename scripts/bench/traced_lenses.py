@@ -99,7 +99,7 @@ def measured(lens: LensLike, seen: Observations, options: CalibrationOptions) ->
     within = reached(seen, columns, rows).reshape(-1)
     return record | {
         "tempering": result.hybrid.tempering,
-        "port": result.camera.model.hybrid.port,
+        "port": "port_x" in result.camera.names,
         "inside": float((distance < CHI2)[good & within].double().mean()),
         "beyond": float((distance < CHI2)[good & ~within].double().mean()),
         "predicted": float(covariance[good].diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt()),

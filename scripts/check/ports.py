@@ -20,11 +20,11 @@ from unittest.mock import patch
 
 import torch
 
-from kcal import Board, CalibrationOptions
-from kcal.sim.captures import sample_board_poses
+from kcal import Board, CalibrationOptions, Observations
+from kcal.sim.captures import LensLike, sample_board_poses
 from scripts.bench.traced_lenses import measured
 from scripts.shared.page import table, tell
-from scripts.shared.port import AIR, WATER, drawn
+from scripts.shared.port import AIR, WATER, PortedCamera, drawn
 from scripts.shared.traced import as_observations
 
 MEDIA = {"no window": None, "window in air": AIR, "window in water": WATER}
@@ -32,19 +32,25 @@ BOARD = Board(columns=11, rows=8, square=0.035)
 VIEWS, NOISE, FILL = 40, 0.1, (0.2, 0.92)
 
 
-def measure(name: str, seed: int) -> dict[str, Any]:
-    """One capture, with the port's terms where kcal wants them, and without."""
-    camera, generator = drawn(MEDIA[name], seed), torch.Generator().manual_seed(seed)
-    poses = sample_board_poses(camera, BOARD, VIEWS, generator, fill=FILL)
+def seen_by(camera: LensLike | PortedCamera, seed: int, views: int = VIEWS, sigma: float = NOISE) -> Observations:
+    """Views of the board in poses that cover the image."""
+    generator = torch.Generator().manual_seed(seed)
+    poses = sample_board_poses(camera, BOARD, views, generator, fill=FILL)  # type: ignore[arg-type]
     rotation, translation = (torch.stack([getattr(p, part) for p in poses]) for part in ("rotation", "translation"))
     pixels, _ = camera.project(BOARD.points @ rotation.mT + translation[:, None])
-    noise = NOISE * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
-    seen = as_observations(pixels + noise, camera.size, BOARD)
-    after = measured(camera, seen, CalibrationOptions())
+    noise = sigma * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
+    return as_observations(pixels + noise, camera.size, BOARD)
+
+
+def measure(name: str, seed: int) -> dict[str, Any]:
+    """One capture, with the port's terms where kcal wants them, and without."""
+    camera = drawn(MEDIA[name], seed)
+    seen = seen_by(camera, seed)
+    after = measured(camera, seen, CalibrationOptions())  # type: ignore[arg-type]
     before = after
     if after.get("port"):
         with patch("kcal.calibrate.hybrid.fit.pupil_recedes", lambda _: False):
-            before = measured(camera, seen, CalibrationOptions())
+            before = measured(camera, seen, CalibrationOptions())  # type: ignore[arg-type]
     return {"medium": name, "seed": seed, "before": before, "after": after}
 
 

@@ -19,10 +19,9 @@ from kcal.io.camera_file import camera_to_file, load_camera, save_camera
 from kcal.lens import LensModel
 from kcal.lens.hybrid_terms import PORT
 from kcal.lens.projection import project_components
-from scripts.check.ports import BOARD
-from scripts.shared.captures import capture_corners
-from scripts.shared.port import GLASS, WATER, PortedCamera
-from scripts.shared.traced import as_observations
+from scripts.check.ports import seen_by
+from scripts.shared.infinity import error_at_infinity
+from scripts.shared.port import WATER, PortedCamera
 
 POINTS = torch.tensor([[0.3, 0.2, 1.2], [-0.4, 0.1, 0.9], [0.0, 0.0, 1.0], [0.06, -0.04, 1.0]], dtype=torch.float64)
 AXIS = (0.06, -0.04)
@@ -62,7 +61,9 @@ def test_rays_start_on_the_normal_and_are_seen_where_they_came_from() -> None:
     pixels = CAMERA.grid(7, 5).flatten(0, 1)
     rays, valid = CAMERA.unproject(pixels)
     origins = CAMERA.ray_origins(rays)
-    torch.testing.assert_close(origins[:, :2], origins[:, 2:] * torch.tensor(AXIS, dtype=torch.float64), rtol=0, atol=1e-15)
+    torch.testing.assert_close(
+        origins[:, :2], origins[:, 2:] * torch.tensor(AXIS, dtype=torch.float64), rtol=0, atol=1e-15
+    )
     assert float(origins[:, 2].min()) < -0.01
     for distance in (0.5, 3.0, 1e9):
         again, seen = CAMERA.project(origins + distance * rays)
@@ -119,10 +120,14 @@ def test_refraction_is_found_under_water_alone(under_water: bool) -> None:
     truth = PortedCamera(
         lens=lens, normal=slopes / slopes.norm(), gap=0.06, thickness=0.01, outside=WATER if under_water else 1.0
     )
-    assert GLASS > WATER
-    shown = capture_corners(truth, 20, sigma=0.01, seed=1, board=BOARD, fill=(0.2, 0.9))
-    result = calibrate_camera(as_observations(shown.pixels, truth.size, BOARD))
+    result = calibrate_camera(seen_by(truth, seed=1, views=16, sigma=0.02))
     form = result.camera.model.hybrid
     assert form is not None
     assert form.port == under_water
     assert ("port" in [found.name for found in result.findings]) == under_water
+    if under_water:
+        normal = error_at_infinity(result.camera, truth).rotation @ truth.normal
+        found = result.camera.coefficients[4:6] - normal[:2] / normal[2]
+        sigma = torch.tensor([result.sigma["port_x"], result.sigma["port_y"]], dtype=torch.float64)
+        assert bool((found.abs() < 4.0 * sigma).all())
+        assert float(sigma.max()) < 0.02
