@@ -299,7 +299,8 @@ def ray_starts(
 
 def ray_origins(rays: Tensor, coefficients: Tensor, port: bool) -> Tensor:
     """Where rays (..., N, 3) of any length start, (..., N, 3), for a hybrid lens (..., P)."""
-    across, ahead, axis = about_axis(*rays.unbind(-1), coefficients, port)
+    X, Y, Z = rays.unbind(-1)
+    across, ahead, axis = about_axis(X, Y, Z, coefficients, port)
     ratio = _angle_over_root(across, ahead)
     depth = pupil_depth(ratio * ratio * across, coefficients, port)
     zero = torch.zeros_like(depth)
