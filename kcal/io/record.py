@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from kcal.checks import as_covariance
 from kcal.errors import InputError
 from kcal.lens.field_modes import SLOPES, FieldModes, GaussianModes, NetworkModes, known_chain, network_names
-from kcal.lens.hybrid_terms import LEADING, HybridForm
+from kcal.lens.hybrid_terms import LEADING, PORT, HybridForm
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
 from kcal.lens.zernike import ZernikeModes
@@ -320,22 +320,25 @@ class HybridRecord(Record):
         modes: of the field, if they are Zernike modes; exactly one of this and the following is in a file.
         gaussian: of the field, if it is made of Gaussian units.
         network: of the field, if it is the last layer of a network.
+        port: whether rays start on the normal of a flat port; absent from the file where they do not.
     """
 
-    _LATER: ClassVar[Mapping[str, Any]] = dict.fromkeys(_KINDS)
+    _LATER: ClassVar[Mapping[str, Any]] = dict.fromkeys(_KINDS) | {"port": False}
 
     shape: float
     radius: float
     modes: ZernikeRecord | None = None
     gaussian: GaussianRecord | None = None
     network: NetworkRecord | None = None
+    port: bool = False
 
     @classmethod
     def of(cls, form: HybridForm) -> HybridRecord:
         """The constants of a lens."""
         modes, own = form.modes, next(key for key, kind in _KINDS.items() if isinstance(form.modes, kind))
         stored = NetworkRecord.of(modes) if isinstance(modes, NetworkModes) else modes
-        return cls.model_validate({"shape": form.shape, "radius": form.radius, own: stored}, from_attributes=True)
+        constants = {"shape": form.shape, "radius": form.radius, "port": form.port, own: stored}
+        return cls.model_validate(constants, from_attributes=True)
 
     @pydantic.model_validator(mode="after")
     def _one_kind(self) -> HybridRecord:
@@ -355,7 +358,7 @@ class HybridRecord(Record):
             modes = GaussianModes(**dict(self.gaussian))
         else:
             modes = ZernikeModes(**dict(self.modes or {}))
-        return HybridForm(shape=self.shape, radius=self.radius, modes=modes)
+        return HybridForm(shape=self.shape, radius=self.radius, modes=modes, port=self.port)
 
 
 class LensOrders(Record):
@@ -402,7 +405,9 @@ class LensOrders(Record):
     def names(self) -> tuple[str, ...]:
         """Names of the coefficients."""
         network = self._own_network
-        return self.model().names if network is None else LEADING + network_names(network.features)
+        if network is None or self.hybrid is None:
+            return self.model().names
+        return LEADING + PORT * self.hybrid.port + network_names(network.features)
 
     @classmethod
     def of(cls, model: LensModel) -> LensOrders:

@@ -22,10 +22,9 @@ from kcal.lens.model import LensModel, larger_model
 from kcal.lens.projection import (
     FAR,
     INTRINSICS,
-    angle_over_distance,
     from_pixels,
     plane_from_points,
-    pupil_depth,
+    ray_origins,
     ray_starts,
     rays_from_plane,
     to_pixels,
@@ -219,6 +218,8 @@ class Camera(ConvertibleCamera):
     def ray_origins(self, rays: Tensor | ArrayLike) -> Tensor:
         """Find where rays start: (0, 0, ζ₁ θ² + ζ₂ θ⁴) for a hybrid lens, the origin for others.
 
+        Behind a flat port they start on the port's normal through the lens, not on the optical axis.
+
         With a ray of `unproject`, every point `ray_origin + t * ray` with t > 0 is projected to the pixel of the ray,
         except for t of the order of the pupil's movement, where rays intersect each other.
 
@@ -237,20 +238,16 @@ class Camera(ConvertibleCamera):
             [[0.0, 0.0, 0.0]]
         """
         rays = self._taken("rays", rays, 3)
-        X, Y, Z = rays.unbind(-1)
-        depth = torch.zeros_like(Z)
-        if self.model.hybrid:
-            ratio = angle_over_distance(X, Y, Z)
-            depth = pupil_depth(ratio * ratio * (X * X + Y * Y), self.coefficients)
-        zero = torch.zeros_like(depth)
-        return torch.stack([zero, zero, depth], -1)
+        if not self.model.hybrid:
+            return torch.zeros_like(rays)
+        return ray_origins(rays, self.coefficients, self.model.hybrid.port)
 
     def _plane_from_points(self, X: Tensor, Y: Tensor, Z: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Map points (..., N) to the plane of the lens, with a mask of where that was found; None: everywhere."""
         if not self.model.hybrid:
             return *plane_from_points(X, Y, Z, self.model), None
-        depth, found = ray_starts(X, Y, Z, self.coefficients)
-        return *plane_from_points(X, Y, Z - depth, self.model), found
+        pupil = ray_starts(X, Y, Z, self.coefficients, port=self.model.hybrid.port)
+        return *plane_from_points(*pupil.moved(X, Y, Z), self.model), pupil.found
 
     def _possibly_valid(self, x: Tensor, y: Tensor, Z: Tensor) -> tuple[Tensor, bool]:
         """Points that are usable and within the outline of the valid region; whether that settles their validity."""

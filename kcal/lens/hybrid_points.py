@@ -401,10 +401,10 @@ def worth_fitting(points: Tensor, parameters: Tensor, model: LensModel) -> bool:
 
 @torch.no_grad()
 def fit_forward(parameters: Tensor, model: LensModel, region: Region) -> Forward | None:
-    """Fit the way from points to pixels; None if polynomials are not accurate enough."""
+    """Fit the way from points to pixels; None if polynomials are not accurate enough, or rays start off the axis."""
     assert model.hybrid
     radius = SURE * float(region.radius) * (1.0 - 1e-12)
-    if not radius > 0:
+    if not radius > 0 or model.hybrid.port:
         return None
     coefficients = parameters[len(INTRINSICS) :]
 
@@ -490,10 +490,10 @@ def _base(
     chart = torch.sqrt(square)
     ahead, across = (1.0 - square) / ((1.0 + square) * nearness), 2.0 * chart / ((1.0 + square) * nearness)
     ahead, across = ahead.flatten(), across.flatten()
-    depth, found = ray_starts(across, torch.zeros_like(across), ahead, coefficients)
-    if not bool(found.all()):
+    pupil = ray_starts(across, torch.zeros_like(across), ahead, coefficients)
+    if not bool(pupil.found.all()):
         return None
-    x, _ = plane_from_points(across, torch.zeros_like(across), ahead - depth, model)
+    x, _ = plane_from_points(*pupil.moved(across, torch.zeros_like(across), ahead), model)
     stretch = (x.unflatten(0, (_NODES, -1)) / (radius * chart)).numpy()
     bound = bound / (radius * math.sqrt(widest))
     series = [trim(row, bound) for row in _series(_series(stretch).T)]
@@ -515,8 +515,8 @@ def _forward_error(forward: Forward, parameters: Tensor, model: LensModel) -> fl
     X, Y, Z = across * torch.cos(turn), across * torch.sin(turn), (1.0 - square) / (1.0 + square) * distance
     pixels, found = forward(torch.stack([X, Y, Z], -1), X.new_empty((forward.rows, len(X))))
     coefficients = parameters[len(INTRINSICS) :]
-    depth, _ = ray_starts(X, Y, Z, coefficients)
-    return _largest_distance(X, Y, Z - depth, pixels, found, parameters, model)
+    moved = ray_starts(X, Y, Z, coefficients).moved(X, Y, Z)
+    return _largest_distance(*moved, pixels, found, parameters, model)
 
 
 def _backward_error(backward: Backward, parameters: Tensor, model: LensModel) -> float:

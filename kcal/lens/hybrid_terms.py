@@ -122,10 +122,12 @@ def _artanh(x: Tensor) -> Tensor:
 # δ ("shape") corrects the shape of the base projection. Z_k are fields on the disc of radius ρ: those of
 # `kcal.lens.zernike`, or another kind of `kcal.lens.field_modes`. Two more coefficients, ζ₁ and ζ₂ ("pupil1" and
 # "pupil2"), move the entrance pupil: a ray at the angle θ from the optical axis starts at (0, 0, ζ₁ θ² + ζ₂ θ⁴), in
-# meters (`kcal.lens.projection`).
+# meters (`kcal.lens.projection`). Behind a flat port there are three more: ζ₃ of θ⁶, and the slopes p and q of the
+# port's normal (p, q, 1), which is the axis then.
 
-# The coefficients before the field's weights.
+# The coefficients before the field's weights; those of a port follow.
 LEADING = ("shape", "pupil1", "pupil2")
+PORT = ("pupil3", "port_x", "port_y")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -137,10 +139,13 @@ class HybridForm:
         radius: ρ of the disc on which the field is defined, on the plane of the base projection. Points outside the
             disc are not valid.
         modes: of the field: `ZernikeModes`, `GaussianModes` or `NetworkModes`.
+        port: whether rays start on the normal of a flat port, not on the optical axis.
 
     Attributes:
         reach: largest distance from the origin of the plane that is valid: ρ, or less where the base projection ends.
-        names: names of the coefficients: "shape", "pupil1", "pupil2", then the weights of the field.
+        leading: names of the coefficients before the weights of the field: "shape", "pupil1", "pupil2"; with a port
+            also "pupil3", "port_x", "port_y".
+        names: names of all coefficients.
 
     Raises:
         InputError: a radius that is not positive, or a shape beyond ±10.
@@ -154,9 +159,11 @@ class HybridForm:
     shape: float
     radius: float
     modes: FieldModes = dataclasses.field(default_factory=ZernikeModes)
+    port: bool = False
 
     # Computed once: compilers cannot trace lazily computed attributes.
     reach: float = dataclasses.field(init=False, repr=False, compare=False)
+    leading: tuple[str, ...] = dataclasses.field(init=False, repr=False, compare=False)
     names: tuple[str, ...] = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -165,7 +172,8 @@ class HybridForm:
         if not abs(self.shape) <= 10:
             raise InputError(f"hybrid lens: the shape of its base projection must lie within ±10, got {self.shape}")
         object.__setattr__(self, "reach", min(self.radius, largest_base_radius(self.shape)))
-        object.__setattr__(self, "names", LEADING + self.modes.names)
+        object.__setattr__(self, "leading", LEADING + PORT * self.port)
+        object.__setattr__(self, "names", self.leading + self.modes.names)
 
     def constants(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """s₀ and 1 / ρ as tensors on the device of `like`: ONNX would write plain numbers as float32."""
@@ -199,7 +207,7 @@ def hybrid_terms(
     growth, growth_slope = growth_by_shape(shape * square)
     bend = unbind_last(coefficients[..., :1])[0]
     scale = 1.0 + bend * square * growth
-    offset = len(LEADING)
+    offset = len(form.leading)
     f, g, *by_place = form.modes.field(coefficients[..., offset:], x * to_disc, y * to_disc, slopes)
     point: tuple[Tensor, ...] = ()
     if slopes:

@@ -50,8 +50,12 @@ def largest_radius(model: LensModel) -> float:
 
 def angle_over_distance(X: Tensor, Y: Tensor, Z: Tensor) -> Tensor:
     """θ / ρ of points (..., N); infinite or NaN on the axis behind the camera."""
-    square = X * X + Y * Y
-    if not (is_traced() or is_differentiated(X, Y, Z)):
+    return _angle_over_root(X * X + Y * Y, Z)
+
+
+def _angle_over_root(square: Tensor, Z: Tensor) -> Tensor:
+    """θ / ρ of points at the depth Z, by ρ²."""
+    if not (is_traced() or is_differentiated(square, Z)):
         distance = torch.sqrt(square)
         return torch.where(distance > 0, torch.atan2(distance, Z) / distance, Z.clamp(min=0.0).reciprocal())
     # tan(angle) / ρ of the half angle, the quarter, ...
@@ -148,6 +152,11 @@ def rays_from_plane(x: Tensor, y: Tensor, model: LensModel) -> tuple[Tensor, Ten
 # in meters: such a camera is not central (Gennery 2006; mrcal's tour of noncentral projection). θ is the angle of the
 # ray itself, so that all points of a ray have the same pixel. The equation is solved by Newton's method, which takes
 # one step from d = 0 for points at long range and two at 1 m. For points at infinity the pupil has no effect.
+#
+# Behind a flat port (`HybridForm.port`) rays start on the port's normal a = (p, q, 1) / |(p, q, 1)| instead of the
+# optical axis, at a d with d = ζ₁ θ² + ζ₂ θ⁴ + ζ₃ θ⁶, where θ is the angle to a and ρ the distance from it: light that
+# a plane refracts stays in the plane of its direction and the normal, so that all rays meet the normal through the lens
+# (Treibitz et al., "Flat refractive geometry", 2012).
 
 # Meters at which a point is as good as infinitely far: an entrance pupil has no effect there. Scaling by a power of two
 # rounds nothing.
@@ -169,6 +178,7 @@ class Pupil(NamedTuple):
         rate: derivative of ζ₁ θ² + ζ₂ θ⁴ by d, divided by ρ².
         gain: 1 / (1 - rate ρ²), the derivative of the solution by a shift of the right side.
         meter: what a meter measures in the units of the points.
+        axis: on which rays start, and the distance along it of the points, (4, ..., N); None: the optical axis.
     """
 
     depth: Tensor
@@ -177,41 +187,104 @@ class Pupil(NamedTuple):
     rate: Tensor
     gain: Tensor
     meter: Tensor | float
+    axis: tuple[Tensor, ...] | None = None
 
-    def by_point(self, X: Tensor, Y: Tensor, below: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Derivatives of the depth by X, Y and Z of the point; `below` is Z - d."""
+    def moved(self, X: Tensor, Y: Tensor, Z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Points less the start of their rays."""
+        if self.axis is None:
+            return X, Y, Z - self.depth
+        a, b, c, _ = self.axis
+        return X - self.depth * a, Y - self.depth * b, Z - self.depth * c
+
+    def along(self, by_point: Tensor) -> Tensor:
+        """(..., 2, N) derivatives along the axis, of those by points (..., 3, 2, N)."""
+        if self.axis is None:
+            return by_point[..., 2, :, :]
+        return sum(by_point[..., i, :, :] * each[..., None, :] for i, each in enumerate(self.axis[:3]))  # type: ignore[return-value]
+
+    def by_point(self, X: Tensor, Y: Tensor, Z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Derivatives of the depth by X, Y and Z of the point."""
         slope = self.rate * self.gain
-        return slope * below * X, slope * below * Y, -slope * (X * X + Y * Y)
+        if self.axis is None:
+            rise = slope * (Z - self.depth)
+            return rise * X, rise * Y, -slope * (X * X + Y * Y)
+        a, b, c, ahead = self.axis
+        rise, turn = slope * (ahead - self.depth), self._by_turn(X, Y, Z)
+        return rise * X + turn * a, rise * Y + turn * b, rise * Z + turn * c
 
-    def by_coefficients(self) -> tuple[Tensor, Tensor]:
-        """Derivatives of the depth by ζ₁ and ζ₂."""
-        first = self.meter * self.gain * self.square
-        return first, first * self.square
+    def _by_turn(self, X: Tensor, Y: Tensor, Z: Tensor) -> Tensor:
+        """Derivative of the depth by the distance along the axis, of points that stay as far away."""
+        assert self.axis is not None
+        whole = X * X + Y * Y + Z * Z
+        return -self.rate * self.gain * (whole - self.axis[3] * self.depth)
+
+    def by_coefficients(self, X: Tensor, Y: Tensor, Z: Tensor, by_point: Tensor) -> list[Tensor]:
+        """(..., 2, N) derivatives of pixels by ζ₁, ζ₂, and where there is a port by ζ₃, p, q.
+
+        `by_point` (..., 3, 2, N) has those by the moved points.
+        """
+        along, rates = self.along(by_point), [self.meter * self.gain * self.square]
+        for _ in range(1 if self.axis is None else 2):
+            rates.append(rates[-1] * self.square)
+        columns = [-along * rate[..., None, :] for rate in rates]
+        if self.axis is not None:
+            *axis, ahead = self.axis
+            turn = self._by_turn(X, Y, Z)
+            for i, value in enumerate((X, Y)):
+                # The axis turns by (e - a aᵢ) c for p or q.
+                depth, share = turn * (value - ahead * axis[i]), self.depth * axis[i]
+                moved = self.depth[..., None, :] * by_point[..., i, :, :] + (depth - share)[..., None, :] * along
+                columns.append(-axis[2][..., None, :] * moved)
+        return columns
 
     def by_meter(self, coefficients: Tensor) -> Tensor:
         """Derivative of the depth by what a meter measures, of points that stay as they are."""
-        return self.gain * pupil_depth(self.square, coefficients)
+        return self.gain * pupil_depth(self.square, coefficients, self.axis is not None)
 
 
-def pupil_depth(square: Tensor, coefficients: Tensor) -> Tensor:
+def pupil_depth(square: Tensor, coefficients: Tensor, port: bool = False) -> Tensor:
     """D of rays with given θ² (..., N), for a hybrid lens (..., P)."""
-    first, second = unbind_last(coefficients[..., 1:3])
-    return (first + second * square) * square
+    return _depth_and_slope(square, coefficients, port)[0]
+
+
+def _depth_and_slope(square: Tensor, coefficients: Tensor, port: bool) -> tuple[Tensor, Tensor]:
+    """D, and its derivative by θ²."""
+    if not port:
+        first, second = unbind_last(coefficients[..., 1:3])
+        return (first + second * square) * square, first + 2.0 * second * square
+    first, second, third = unbind_last(coefficients[..., 1:4])
+    slope = first + (2.0 * second + 3.0 * third * square) * square
+    return (first + (second + third * square) * square) * square, slope
+
+
+def about_axis(
+    X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, port: bool
+) -> tuple[Tensor, Tensor, tuple[Tensor, ...] | None]:
+    """ρ² of points (..., N) and their distance along the axis, and `Pupil.axis`, for a hybrid lens (..., P)."""
+    if not port:
+        return X * X + Y * Y, Z, None
+    p, q = unbind_last(coefficients[..., 4:6])
+    c = torch.rsqrt(1.0 + p * p + q * q)
+    a, b = p * c, q * c
+    ahead = a * X + b * Y + c * Z
+    across = (X - ahead * a).square() + (Y - ahead * b).square() + (Z - ahead * c).square()
+    return across, ahead, torch.broadcast_tensors(a, b, c, ahead)
 
 
 def ray_starts(
-    X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, meter: Tensor | float = 1.0
-) -> tuple[Tensor, Tensor]:
-    """Find the depth (..., N) at which the rays to points start, for a hybrid lens (..., P), and whether it was found.
+    X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, meter: Tensor | float = 1.0, *, port: bool = False
+) -> Pupil:
+    """Find where the rays to points start, for a hybrid lens (..., P): depth and found, (..., N), and on which axis.
 
     Points and depth are in units of which a meter is `meter` (..., N). At infinity that is 0, and the pupil stays.
 
     Two of Newton's steps are in the autograd graph; at a solution these have its exact first and second derivatives.
     """
+    across, ahead, axis = about_axis(X, Y, Z, coefficients, port)
     with torch.no_grad():
-        depth = torch.zeros_like(Z)
+        depth = torch.zeros_like(ahead)
         for _ in range(_STEPS):
-            wanted, pupil = _pupil_at(X, Y, Z, coefficients, depth, meter)
+            wanted, pupil = _pupil_at(across, ahead, coefficients, depth, meter, axis)
             step = (wanted - depth) * pupil.gain
             depth = depth + step
             found = pupil.found & (step * step <= _LAST_STEP**2 * (X * X + Y * Y + Z * Z))
@@ -219,30 +292,47 @@ def ray_starts(
                 break
     if is_differentiated(X, Y, Z, coefficients, meter if isinstance(meter, Tensor) else None):
         for _ in range(2):
-            wanted, pupil = _pupil_at(X, Y, Z, coefficients, depth, meter)
+            wanted, pupil = _pupil_at(across, ahead, coefficients, depth, meter, axis)
             depth = depth + (wanted - depth) * pupil.gain
-    return depth, found
+    return pupil._replace(depth=depth, found=found)
 
 
-def entrance_pupil(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, meter: Tensor | float = 1.0) -> Pupil:
+def ray_origins(rays: Tensor, coefficients: Tensor, port: bool) -> Tensor:
+    """Where rays (..., N, 3) of any length start, (..., N, 3), for a hybrid lens (..., P)."""
+    X, Y, Z = rays.unbind(-1)
+    across, ahead, axis = about_axis(X, Y, Z, coefficients, port)
+    ratio = _angle_over_root(across, ahead)
+    depth = pupil_depth(ratio * ratio * across, coefficients, port)
+    zero = torch.zeros_like(depth)
+    return torch.stack([zero, zero, depth] if axis is None else [depth * each for each in axis[:3]], -1)
+
+
+def entrance_pupil(
+    X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, meter: Tensor | float = 1.0, *, port: bool = False
+) -> Pupil:
     """As `ray_starts`, with what closed-form derivatives need."""
-    depth, found = ray_starts(X, Y, Z, coefficients, meter)
-    _, pupil = _pupil_at(X, Y, Z, coefficients, depth, meter)
-    return pupil._replace(found=found)
+    found = ray_starts(X, Y, Z, coefficients, meter, port=port)
+    across, ahead, axis = about_axis(X, Y, Z, coefficients, port)
+    return _pupil_at(across, ahead, coefficients, found.depth, meter, axis)[1]._replace(found=found.found)
 
 
 def _pupil_at(
-    X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, depth: Tensor, meter: Tensor | float
+    across: Tensor,
+    ahead: Tensor,
+    coefficients: Tensor,
+    depth: Tensor,
+    meter: Tensor | float,
+    axis: tuple[Tensor, ...] | None,
 ) -> tuple[Tensor, Pupil]:
-    """The right side of the equation for a ray that starts at `depth`."""
-    first, second = unbind_last(coefficients[..., 1:3])
-    across, below = X * X + Y * Y, Z - depth
-    ratio = angle_over_distance(X, Y, below)
+    """The right side of the equation for a ray that starts at `depth`, to points of `about_axis`."""
+    below = ahead - depth
+    ratio = _angle_over_root(across, below)
     square = ratio * ratio * across
+    value, slope = _depth_and_slope(square, coefficients, axis is not None)
     # θ² grows by 2 θ ρ / R² with d.
-    rate = 2.0 * meter * (first + 2.0 * second * square) * ratio / (across + below * below)
+    rate = 2.0 * meter * slope * ratio / (across + below * below)
     gain = (1.0 - rate * across).reciprocal()
-    return meter * (first + second * square) * square, Pupil(depth, gain > 0, square, rate, gain, meter)
+    return meter * value, Pupil(depth, gain > 0, square, rate, gain, meter, axis)
 
 
 # Project points to pixels by the chain pinhole, lens, intrinsics, with its closed-form Jacobian.
@@ -322,10 +412,11 @@ def project_components(
     """
     X, Y, Z = points[..., 0, :], points[..., 1, :], points[..., 2, :]
     offset = len(INTRINSICS)
-    pupil = entrance_pupil(X, Y, Z, parameters[..., offset:], meter) if model.hybrid else None
-    if pupil:
-        Z = Z - pupil.depth
-    x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(X, Y, Z, model)
+    pupil, moved = None, (X, Y, Z)
+    if model.hybrid:
+        pupil = entrance_pupil(X, Y, Z, parameters[..., offset:], meter, port=model.hybrid.port)
+        moved = pupil.moved(X, Y, Z)
+    x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(*moved, model)
     plane = torch.stack([x, y], -2) if model.hybrid and wanted is not None else None
     lens_wanted = [i - offset for i in wanted or () if i >= offset]
     lens = distort_components(x, y, parameters[..., offset:], model, lens_wanted)
@@ -335,7 +426,7 @@ def project_components(
         regular = regular & pupil.found
     pixels = torch.stack(to_pixels(lens.x, lens.y, parameters), -2)
     if not model.wide:
-        regular = regular & (Z > 0)
+        regular = regular & (Z > 0)  # Such a lens has no pupil.
     empty = pixels.new_zeros((*pixels.shape[:-2], 0, *pixels.shape[-2:]))
     if wanted is None:
         return Projection(pixels, empty, empty, regular)
@@ -352,12 +443,12 @@ def project_components(
         columns = [ux, vx, uy, vy, -(ux * x + uy * y), -(vx * x + vy * y)]
     by_point = torch.stack(torch.broadcast_tensors(*columns), -2).unflatten(-2, (3, 2))
 
-    by_meter = None
+    by_meter, by_moved = None, by_point
     if pupil:
-        by_depth = by_point[..., 2, :, :]
+        by_depth = pupil.along(by_moved)
         by_meter = -by_depth * pupil.by_meter(parameters[..., offset:])[..., None, :]
-        moved = torch.stack(torch.broadcast_tensors(*pupil.by_point(X, Y, Z)), -2)[..., None, :]
-        by_point = by_point - by_depth[..., None, :, :] * moved
+        rise = torch.stack(torch.broadcast_tensors(*pupil.by_point(X, Y, Z)), -2)[..., None, :]
+        by_point = by_moved - by_depth[..., None, :, :] * rise
     if not wanted:
         return Projection(pixels, by_point, empty, regular, by_meter, plane)
 
@@ -379,7 +470,7 @@ def project_components(
     if order != list(range(len(wanted))):
         by_camera = by_camera[..., [order.index(k) for k in range(len(wanted))], :, :]
     if pupil:
-        for place, rate in enumerate(pupil.by_coefficients(), offset + 1):
+        for place, column in enumerate(pupil.by_coefficients(X, Y, Z, by_moved), offset + 1):
             if place in wanted:
-                by_camera[..., list(wanted).index(place), :, :] = -by_depth * rate[..., None, :]
+                by_camera[..., list(wanted).index(place), :, :] = column
     return Projection(pixels, by_point, by_camera, regular, by_meter, plane)

@@ -38,8 +38,7 @@ from kcal import KcalError, Observations
 from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.lens import pixel_covariance
-from kcal.sim.captures import drawn_lens
-from kcal.sim.truth import TruthLens
+from kcal.sim.captures import LensLike, drawn_lens
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.page import table, write_section
 from scripts.shared.prescriptions import PRESCRIPTIONS
@@ -80,7 +79,7 @@ def cells(
             yield head | measured(lens, seen, MODELS[model])
 
 
-def measured(lens: TruthLens, seen: Observations, options: CalibrationOptions) -> dict[str, Any]:
+def measured(lens: LensLike, seen: Observations, options: CalibrationOptions) -> dict[str, Any]:
     """One calibration against the truth."""
     start = time.process_time()
     try:
@@ -100,6 +99,7 @@ def measured(lens: TruthLens, seen: Observations, options: CalibrationOptions) -
     within = reached(seen, columns, rows).reshape(-1)
     return record | {
         "tempering": result.hybrid.tempering,
+        "port": "port_x" in result.camera.names,
         "inside": float((distance < CHI2)[good & within].double().mean()),
         "beyond": float((distance < CHI2)[good & ~within].double().mean()),
         "predicted": float(covariance[good].diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt()),

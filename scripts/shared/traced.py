@@ -58,11 +58,11 @@ def captures(
     return out
 
 
-def as_observations(pixels: Tensor, size: tuple[int, int]) -> Observations:
+def as_observations(pixels: Tensor, size: tuple[int, int], board: Board = BOARD) -> Observations:
     """Corners (V, N, 2) of the board, NaN where not seen, as an observations file."""
     corners = [tuple(None if u != u else (u, v) for u, v in view) for view in pixels.tolist()]
     views = tuple(View(name=f"{i:03d}", pixels=view) for i, view in enumerate(corners))
-    return Observations(board=BOARD, image_size=size, views=views)
+    return Observations(board=board, image_size=size, views=views)
 
 
 def pupil_of(lens: TruthLens) -> float:

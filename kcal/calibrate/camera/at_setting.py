@@ -129,6 +129,8 @@ def usable_information(camera: Camera, first: Camera, name: str, first_name: str
     if camera.size != first.size:
         sizes = [f"{width}x{height} px" for width, height in (camera.size, first.size)]
         raise InputError(f"{name}: its image is {sizes[0]}, that of {first_name} {sizes[1]}: not one camera")
+    if camera.model.hybrid and camera.model.hybrid.port:
+        raise InputError(f"{name}: it looks through a flat port, which is not interpolated: calibrate at that setting")
     known = camera.calibration
     if known is None or known.setting is None:
         raise InputError(

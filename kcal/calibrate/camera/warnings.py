@@ -177,9 +177,10 @@ def corner_pupil(camera: Camera, covariance: Tensor) -> CornerPupil | None:
     if not bool(valid.any()):
         return None
     angle = torch.acos(rays[valid][:, 2].clamp(-1.0, 1.0)).max()
-    place = [camera.names.index(name) for name in ("pupil1", "pupil2")]
-    slope = torch.stack([angle**2, angle**4])
-    depth = pupil_depth(angle[None] ** 2, camera.params.detach()[5:])
+    port = camera.model.hybrid.port
+    place = [i for i, name in enumerate(camera.names) if name.startswith("pupil")]
+    slope = torch.stack([angle ** (2 * k) for k in range(1, 1 + len(place))])
+    depth = pupil_depth(angle[None] ** 2, camera.params.detach()[5:], port)
     variance = slope @ covariance[place][:, place] @ slope
     return CornerPupil(float(depth[0]), math.sqrt(max(float(variance), 0.0)), float(angle))
 
@@ -194,6 +195,8 @@ def pupil_findings(camera: Camera, covariance: Tensor) -> list[Finding]:
     pupil = corner_pupil(camera, covariance)
     if pupil is None:
         return []
+    if camera.model.hybrid and camera.model.hybrid.port:
+        return [_port_finding(camera, covariance, pupil)]
     most = max(_LEAST, _GLASS * pupil.angle**2)
     if not abs(pupil.depth) > max(most, _SURE * pupil.sigma):
         return []
@@ -205,6 +208,32 @@ def pupil_findings(camera: Camera, covariance: Tensor) -> list[Finding]:
     )
     action = "measure the squares, and photograph a stiff board at rest, tilted by 30 to 45 degrees in all directions"
     return [Finding("pupil", "doubt", text, action)]
+
+
+# Index of refraction of water.
+_WATER = 1.333
+
+
+def _port_finding(camera: Camera, covariance: Tensor, pupil: CornerPupil) -> Finding:
+    """What a flat port is like, in numbers."""
+    p, q = camera.coefficients.detach()[4:6].tolist()
+    slope, place = math.hypot(p, q), [camera.names.index(name) for name in ("port_x", "port_y")]
+    along = torch.tensor([p, q], dtype=torch.float64) / max(slope, 1e-12)
+    tilt, sigma = (math.degrees(x) for x in (math.atan(slope), math.sqrt(along @ covariance[place][:, place] @ along)))
+    inside = 1.0 - (_WATER * math.sin(pupil.angle)) ** 2
+    text = (
+        f"rays towards the image's corners start {-1e3 * pupil.depth:.1f} ± {1e3 * pupil.sigma:.1f} mm behind the "
+        "central ones, which no lens does: a flat port is fitted"
+    )
+    if inside > 0:
+        recedes = _WATER * (math.cos(pupil.angle) / math.sqrt(inside) - 1.0)
+        gap, spread = (1e3 * x / recedes for x in (-pupil.depth, pupil.sigma))
+        text += f", in water with {gap:.0f} ± {spread:.0f} mm of air behind it"
+    action = (
+        "use the camera in the same water; without a port, measure the squares, and photograph a stiff board at rest, "
+        "tilted by 30 to 45 degrees in all directions"
+    )
+    return Finding("port", "doubt", f"{text}, its normal {tilt:.1f} ± {sigma:.1f}° off the camera's axis", action)
 
 
 # Checks of a finished calibration.

@@ -15,7 +15,6 @@ from kcal.calibrate.hybrid.board_modes import CLEAR, find_turns, turned, turned_
 from kcal.calibrate.hybrid.evidence import Quadratic, negative_log_evidence
 from kcal.calibrate.hybrid.families import (
     BOARD,
-    LEADING_UNKNOWNS,
     Hyperprior,
     LensPrior,
     PriorFamilies,
@@ -107,7 +106,7 @@ def typical_lens(form: HybridForm, families: PriorFamilies, h: Tensor, square: b
         h: (H,).
         square: whether pixels are square.
     """
-    count = LEADING_UNKNOWNS + len(form.modes) + (0 if square else 1)
+    count = 3 + len(form.names) + (0 if square else 1)
     mean, sd = families.mean[:count].clone(), families.deviation(h)[:count].clone()
     sd[0] = _FOCAL * mean[0]
     if not square:

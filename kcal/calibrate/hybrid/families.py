@@ -30,6 +30,8 @@ SQUARE = 1e-4
 _FOCAL = 0.2
 # Of the principal point about the middle, in diagonals.
 _CENTER = 0.05
+# Slopes of a port's normal to the optical axis: a few degrees.
+_SLOPE = 0.05
 
 
 class Hyperprior(NamedTuple):
@@ -87,6 +89,13 @@ class PriorFamilies(NamedTuple):
             *(torch.cat([part[: len(part) - modes], new]) for part, new in zip(self, own, strict=True))
         )
 
+    def with_port(self) -> PriorFamilies:
+        """The priors of the same lens behind a flat port: ζ₃ and two slopes follow the pupil."""
+        pupil, at, slope = PUPIL.start, LEADING_UNKNOWNS, math.log(_SLOPE)
+        own = ([0.0] * 3, [float(self.log_unit[pupil]), slope, slope], [int(self.amplitude[pupil]), -1, -1], [-1] * 3)
+        more = [each.new_tensor(values) for each, values in zip(self, (*own, [0.0] * 3), strict=True)]
+        return PriorFamilies(*(torch.cat([each[:at], new, each[at:]]) for each, new in zip(self, more, strict=True)))
+
     def deviation(self, h: Tensor) -> Tensor:
         """(..., S) prior standard deviations, of hyperparameters (..., H)."""
         out = self.log_unit + torch.where(self.amplitude >= 0, h[..., self.amplitude], 0.0)
@@ -121,7 +130,7 @@ class LensPrior(NamedTuple):
     @property
     def square(self) -> bool:
         """Whether pixels are square."""
-        return len(self.unknowns.mean) == LEADING_UNKNOWNS + len(self.form.modes)
+        return len(self.unknowns.mean) == 3 + len(self.form.names)
 
     def families(self, usual: PriorFamilies) -> PriorFamilies:
         """The usual priors with those of the lens replaced by these."""
@@ -164,7 +173,7 @@ def prior_families(
     field_unit = [math.log(form.radius) + (math.log(SQUARE) if own is None else 0.0) for own in amplitude]
     none, more = [-1] * len(leading), [-1] * len(rows)
     board_family = torch.where(board.family == KNOWN, -1, by_pupil + 1 + board.family)
-    return PriorFamilies(
+    families = PriorFamilies(
         mean,
         torch.cat(
             [
@@ -181,6 +190,7 @@ def prior_families(
             ]
         ),
     )
+    return families.with_port() if form.port else families
 
 
 def _numbers(indices: Sequence[int | None]) -> list[int]:

@@ -17,7 +17,7 @@ from kcal.calibrate.hybrid.board_modes import STRETCH, BoardModes, board_modes
 from kcal.calibrate.hybrid.evidence import WORTH, Amplitudes, posterior_root
 from kcal.calibrate.hybrid.families import (
     BOARD,
-    LEADING_UNKNOWNS,
+    PUPIL,
     LensPrior,
     PriorFamilies,
     typical_hyperprior,
@@ -43,9 +43,10 @@ from kcal.errors import InputError
 from kcal.gaussian import triangular
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
-from kcal.lens.hybrid_terms import LEADING
+from kcal.lens.hybrid_terms import LEADING, PORT, angle_over_radius
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
+from kcal.lens.projection import INTRINSICS, pupil_depth
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.schur import products_of
 from kcal.texts import brief
@@ -100,6 +101,43 @@ def with_square_pixels(estimate: Estimate, board: BoardModes) -> Estimate | None
     rows = len(estimate.families.mean) - len(board.unit) - 1
     families = PriorFamilies(*(torch.cat([part[:rows], part[rows + 1 :]]) for part in estimate.families))
     return estimate._replace(families=families, state=estimate.state._replace(parameters=params))
+
+
+# Decide whether the camera looks through a flat port into water: rays then start on the port's normal.
+#
+# The entrance pupil of a lens comes forward with the angle, or a flat port of it does in air. Behind a flat port under
+# water it recedes, by gap μ (cos θ / √(1 - μ² sin² θ) - 1).
+
+# Meters per square radian by which no lens's entrance pupil recedes: traced ones come forward by as much.
+_RECEDES = 3e-3
+
+
+def pupil_recedes(rounds: Rounds) -> bool:
+    """Whether rays towards the image's corners start farther back than central ones, more than glass and chance do."""
+    estimate = rounds.estimate
+    form, params = estimate.model.hybrid, estimate.state.parameters
+    assert form is not None
+    radius = 0.5 * math.hypot(*rounds.capture.size) / params[0]
+    square = (radius * angle_over_radius(form.shape * radius**2)) ** 2
+    depth = pupil_depth(square, params[len(INTRINSICS) :])
+    if not depth < -_RECEDES * square:
+        return False
+    deviation = torch.where(rounds.capture.held(estimate), 0.0, estimate.deviation)
+    still = rounds.data.integrated(estimate.amplitudes.log_ratio).data
+    half = posterior_root(still.K, deviation, estimate.variance) * deviation
+    return bool(depth < -_CLEAR * (half[:, PUPIL] @ torch.stack([square, square**2])).norm())
+
+
+def behind_port(estimate: Estimate) -> Estimate:
+    """The same with the terms of a port, which are zero as yet."""
+    form, state, at = estimate.model.hybrid, estimate.state, len(INTRINSICS) + len(LEADING)
+    assert form is not None
+    parameters = torch.cat([state.parameters[:at], state.parameters.new_zeros(len(PORT)), state.parameters[at:]])
+    return estimate._replace(
+        model=LensModel(hybrid=dataclasses.replace(form, port=True)),
+        families=estimate.families.with_port(),
+        state=state._replace(parameters=parameters),
+    )
 
 
 # Find where a fit of one camera settles: base projection, then rounds of solver and evidence, and what these decide.
@@ -248,6 +286,8 @@ def settle(
         other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))
         if other.untempered_loss < rounds.untempered_loss:
             rounds = other
+    if lens is None and pupil_recedes(rounds):
+        rounds = run(rounds.capture, behind_port(rounds.estimate), rounds.steps)
     return rounds
 
 
@@ -510,13 +550,14 @@ def fit_hybrid(
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
     assert model.hybrid is not None
     peaks = torch.tensor(model.hybrid.modes.peaks, dtype=torch.float64)
-    field = slice(LEADING_UNKNOWNS, LEADING_UNKNOWNS + len(peaks))
+    first = 3 + len(model.hybrid.leading)
+    field = slice(first, first + len(peaks))
     unfelt = families.deviation(h)[field] * float(state.parameters[0]) * peaks < _UNFELT
     held = capture.held(estimate)
     held[field] |= unfelt
     if bool(unfelt.any()):
         parameters = state.parameters.clone()
-        parameters[5 + len(LEADING) :][unfelt] = families.mean[field][unfelt]
+        parameters[2 + first :][unfelt] = families.mean[field][unfelt]
         estimate = estimate._replace(state=state._replace(parameters=parameters))
     problem, estimate, steps = capture.solved(estimate, LAST, last_step=True, held=held)
     reduced, displaced = problem.reduced_rows(estimate.state), None if known is None else known.corners

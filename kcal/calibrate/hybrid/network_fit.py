@@ -18,12 +18,10 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vmap
 
-from kcal.calibrate.hybrid.families import LEADING_UNKNOWNS
 from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews, Rounds, run_rounds
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.errors import InputError
 from kcal.lens.field_modes import NetworkModes
-from kcal.lens.hybrid_terms import LEADING
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS, project_components
 from kcal.solve.schur import products_of, without_local
@@ -143,7 +141,8 @@ def _with_weights(estimate: Estimate, weights: Tensor) -> Estimate:
             part.copy_(values)
     modes = NetworkModes(trunk, vector=form.modes.vector)
     degree = estimate.families.degree.clone()
-    degree[LEADING_UNKNOWNS : LEADING_UNKNOWNS + len(modes)] = torch.tensor([p.degree for p in modes.weight_priors])
+    first = len(form.leading) + 3
+    degree[first : first + len(modes)] = torch.tensor([p.degree for p in modes.weight_priors])
     model = LensModel(hybrid=dataclasses.replace(form, modes=modes))
     return estimate._replace(model=model, families=estimate.families._replace(degree=degree))
 
@@ -171,7 +170,7 @@ class _Moved:
         assert plane is not None
         self.factor = problem.shown(torch.where(turn.capture.seen, turn.capture.weights, 0.0))
         self.places = torch.where(self.factor[..., None] > 0, plane.transpose(-1, -2) / model.hybrid.radius, 0.0)
-        self.coefficients = state.parameters[len(INTRINSICS) + len(LEADING) :]
+        self.coefficients = state.parameters[len(INTRINSICS) + len(model.hybrid.leading) :]
         self.focal = state.parameters[:2]
         self.names = [name for name, _ in self.trunk.named_parameters()]
 

@@ -222,7 +222,7 @@ class BoardProblem(SchurProblem[BoardState]):
         self.joint = not model.hybrid
         self._shown: list[tuple[BoardState, _Imaged]] = []
         self._slots = torch.tensor(self.free.slots, dtype=torch.long, device=pixels.device)
-        first = len(INTRINSICS) + len(LEADING)
+        first = len(INTRINSICS) + len(model.hybrid.leading if model.hybrid else LEADING)
         self._leading = [index for index in self.free.indices if index < first]
         self._field = self._field_slots(first, weights) if model.hybrid and not batch else None
         self.terms = tuple(terms)
