@@ -178,7 +178,7 @@ def main() -> None:
     torch.set_num_threads(1)
     if arguments.seeds is not None:
         keys = [*itertools.product(arguments.kinds, arguments.noises, arguments.views, arguments.seeds)]
-        finish(arguments.out[0], sorted(keys, key=lambda key: key[3]), simulation, line)
+        finish(arguments.out[0], sorted(keys, key=lambda key: int(str(key[3]))), simulation, line)
     if arguments.real:
         pairs = [("real", *names) for pair in PAIRS for names in (pair, pair[::-1])]
         finish(arguments.out[0], pairs, lambda _, one, other: real(one, other, arguments.cache), line)

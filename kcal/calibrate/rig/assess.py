@@ -13,6 +13,7 @@ from torch import Tensor
 
 import kcal.calibrate.rig.explanations as explanations
 from kcal.calibrate.rig.adjustment import Adjustment
+from kcal.calibrate.rig.disagreement import widen_for_parts
 from kcal.calibrate.rig.features import FeatureBlock
 from kcal.calibrate.rig.initial_poses import InitialPoses
 from kcal.calibrate.rig.motion import moved_findings, scatter_findings
@@ -515,6 +516,7 @@ def rig_result(
     widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
     if widen > 1.0:
         covariance = SharedCovariance(problem, state, widen**2 * fit.variance)
+    apart = widen_for_parts(work, mask, problem, state, covariance, widen**2 * fit.variance)
     more = check_poses(problem, state, covariance, data.names, refuse=refuse)
     doubts += [] if doubts else more
     refuse_several(work, mask)
@@ -536,6 +538,7 @@ def rig_result(
     if fit.variance > 1.0:
         times = math.sqrt(fit.variance)
         doubt("sigmas", f"residuals are {times:.1f} times as large as their sigmas say; the covariance was widened")
+    findings += apart
     findings += [Finding("contradiction", "stop" if one in certain else "doubt", one.text) for one in against]
     only_boards = len(problem.blocks) == 1 and problem.blocks[0].many
     if only_boards and (count := int(mask.sum())) < _FEW_BOARDS:
