@@ -3,7 +3,6 @@
 import dataclasses
 
 import pytest
-import torch
 
 from kcal import RigData, solve_rig
 from kcal.calibrate.rig.result import RigResult
