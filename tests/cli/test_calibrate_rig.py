@@ -209,9 +209,9 @@ class TestCalibrate:
         text = command.refuses("calibrate left.obs.json -o shut/a.json")
         assert "no permission to write here" in text
 
-    def test_output_is_checked_before_the_input_is_read(self, folder: Path, command: Command) -> None:
-        """With both wrong, the output is named: no minute is spent on what cannot be written."""
-        assert "make it first" in command.refuses("calibrate none.json -o no/a.json")
+    def test_output_is_checked_before_any_work(self, folder: Path, command: Command) -> None:
+        """No minute is spent on what cannot be written; a rig's output is checked even before its inputs are read."""
+        assert "make it first" in command.refuses("calibrate left.obs.json -o no/a.json")
         text = command.refuses("rig none.json none.json", PAIRS, "-o no/a.json")
         assert "make it first" in text
 

@@ -17,8 +17,8 @@ from kcal.finding import Finding
 from kcal.gaussian import triangular
 
 # An error of a lens, of matching or of a board that bends is alike for items that are near each other, so it does not
-# average out as noise does. Items are put into groups, by place in the image, by range, or each board by itself, and
-# each group may have an offset of its own in one of the quantities that the rig shares: a random effect of variance τ².
+# average out as noise does. Items are put into groups, by place in the image or by range, and each group may have an
+# offset of its own in one of the quantities that the rig shares: a random effect of variance τ².
 #
 # No group is solved by itself. At the solution, the score of an offset of group g along the direction d is
 # u_g = dᵀ Σ B e over the rows B and residuals e of its items, and all scores together have the covariance
@@ -30,8 +30,8 @@ from kcal.gaussian import triangular
 # each direction, however many ways are tried (Markov's inequality). Below that nothing is widened:
 # `scripts/check/contradictions.py` measured that σ would grow by half without a reason.
 
-# Items of a group, at least; groups along a line, and along each side of a grid, at most; boards to compare, at least.
-_MEMBERS, _LINE, _SIDE, _BOARDS = 5, 4, 3, 4
+# Items of a group, at least; groups along a line, and along each side of a grid, at most.
+_MEMBERS, _LINE, _SIDE = 5, 4, 3
 # τ² times the mean information about an offset: a quarter to 256, each power of two as likely.
 _RATIOS = 2.0 ** torch.arange(-2, 9, dtype=torch.float64)
 # Mean Bayes factor from which a contradiction is told, and its groups' offsets widen the covariance.
@@ -187,18 +187,13 @@ def _partitions(work: Adjustment, mask: Tensor, state: RigState) -> Iterator[_Pa
     """All ways to put items that took part into groups."""
     used = [(source, at) for source, at in work.sources if bool(mask[at].any())]
     for block, (source, at) in enumerate(used):
-        chosen = mask[at]
-        names = [name for name, taken in zip(source.names, chosen.tolist(), strict=True) if taken]
         if source.least > 1:
-            if len(names) >= _BOARDS:
-                text = "check that the board is stiff, and that all cameras saw it at the same moment"
-                yield _Partition(
-                    block, source.kind, torch.arange(len(names)), tuple(f"{source.kind} {n}" for n in names), text
-                )
+            # One wrong board among few is told otherwise, and would widen what the others say.
             continue
+        chosen = mask[at]
         yield from _by_place(block, source, work, chosen)
         where = source.places(work.state.items[at], work.anchor)
-        if where is not None and (lines := min(_LINE, len(names) // _MEMBERS)) > 1:
+        if where is not None and (lines := min(_LINE, int(chosen.sum()) // _MEMBERS)) > 1:
             far = (where[chosen] - state.center[0]).norm(dim=-1)
             group, text = _ranked(far, lines), "check whether near ones moved, and what is known of their ranges"
             ends = [(float(far[group == g].min()), float(far[group == g].max())) for g in range(lines)]

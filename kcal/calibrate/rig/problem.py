@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -132,9 +132,12 @@ class RigProblem:
         total, falls = terms @ terms.T + sum(grams, torch.zeros(())), []
         for block, parts, own in zip(self.blocks, found, squares, strict=True):
             if block.many:
-                others = torch.stack([_others_fall(total, gram) for gram in self._item_grams(block, parts)])
+                each = (self._gram(block, _of_item(parts, i)) for i in range(len(block)))
+                others = torch.stack([_others_fall(total, gram) for gram in each])
             else:
-                others = _few_others_fall(total, self._own_rows(block, parts))
+                others = _few_others_fall(
+                    total, EliminatedItems(block.joined(parts, self.shared_size), block.size).rows
+                )
             falls.append(own + others)
         return falls
 
@@ -147,20 +150,11 @@ class RigProblem:
         """
         out, (found, _) = list[Tensor](), self._rows(state)
         for block, parts in zip(self.blocks, found, strict=True):
-            if block.many:
-                out.append(torch.stack([gram @ onto for gram in self._item_grams(block, parts)]))
-            else:
-                rows = self._own_rows(block, parts)
-                out.append(rows @ (rows.mT @ onto))
+            rows = onto.new_zeros(0, len(onto), 0)
+            if not block.many:
+                rows = EliminatedItems(block.joined(parts, self.shared_size), block.size).rows
+            out.append(rows @ (rows.mT @ onto))
         return out
-
-    def _own_rows(self, block: Block, parts: Sequence[CameraRows]) -> Tensor:
-        """(V, S + 1, k) rows of each item that its own unknowns cannot change."""
-        return EliminatedItems(block.joined(parts, self.shared_size), block.size).rows
-
-    def _item_grams(self, block: Block, parts: Sequence[CameraRows]) -> Iterator[Tensor]:
-        """(S + 1, S + 1) of each item by itself."""
-        return (self._gram(block, _of_item(parts, i)) for i in range(len(block)))
 
     def block_grams(self, state: RigState) -> list[Tensor]:
         """For each block (S + 1, S + 1) products of the rows of all its items, their own unknowns eliminated."""
