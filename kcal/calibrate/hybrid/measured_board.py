@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import pydantic
 import torch
@@ -285,11 +285,13 @@ class BoardFile(NativeFile):
         half: rows of a matrix whose transpose times itself is their covariance.
         log_evidence: nats by which the data prefer this board over the ordered one.
         observations: names of the observations that it was measured from.
-        corners: meters in x and y by which each corner is off its place beside the modes.
+        corners: meters in x and y by which each corner is off its place beside the modes; absent from the file where
+            that is not known.
     """
 
     KIND: ClassVar[str] = "board"
     VERSION: ClassVar[int] = 1
+    _LATER: ClassVar[Mapping[str, Any]] = {"corners": None}
 
     name: str
     board: Board
