@@ -34,7 +34,7 @@ def parse(command: str, patch: pytest.MonkeyPatch) -> None:
     """Start the script of a command, and stop it when it has read its arguments."""
     words = [word for word in shlex.split(command) if not re.match(r"[A-Z_]+=", word)]
     source = (ROOT / f"{words[2].replace('.', '/')}.py").read_text(encoding="utf-8")
-    assert "argparse.ArgumentParser(" in source, "without a parser the script would run"
+    assert re.search(r"argparse\.ArgumentParser\(|^    run\(\)$", source, re.MULTILINE), "it would run, not parse"
     patch.setattr(sys, "argv", words[2:])
     read = argparse.ArgumentParser.parse_args
 

@@ -6,7 +6,6 @@ python -m scripts.bench.layer --write    puts the table into the page
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -17,8 +16,9 @@ from torch import Tensor
 from kcal.calibrate.camera.layer import CalibratedViews, calibrate_views
 from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.problem.board_problem import BoardProblem
-from scripts.shared.page import write_section
-from scripts.shared.timing import row, show
+from scripts.shared.page import table
+from scripts.shared.sections import run, section
+from scripts.shared.timing import row
 from scripts.shared.views import MODELS, SIZE, simulate
 
 VIEWS, REPEATS, STEP = (30, 200, 800), 3, 1e-3
@@ -84,21 +84,12 @@ def study(views: int, lens: str) -> str:
     return row(views, lens, *(f"{value:.3f}" for value in cells), f"{error:.1e}", linear)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    lines = [
-        row("views", "lens", "from nothing, s", "again, s", "gradient, s", "error", "Gauss-Newton"),
-        "|---|---|---|---|---|---|---|",
-    ]
-    show(lines[-2:])
-    for views in VIEWS:
-        for lens in LENSES:
-            if lens != "default" or views <= MOST_DEFAULT:
-                lines += show([study(views, lens)])
-    write_section("solver.md", "gradients", lines, write=arguments.write)
+@section("solver.md", "gradients", most=VIEWS[0])
+def gradients(most: int = VIEWS[-1]) -> list[str]:
+    heads = ["views", "lens", "from nothing, s", "again, s", "gradient, s", "error", "Gauss-Newton"]
+    wanted = [(n, lens) for n in VIEWS if n <= most for lens in LENSES if lens != "default" or n <= MOST_DEFAULT]
+    return [*table(heads, []), *(study(n, lens) for n, lens in wanted)]
 
 
 if __name__ == "__main__":
-    main()
+    run()

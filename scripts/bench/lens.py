@@ -10,7 +10,6 @@ kcal is faster.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
 import time
@@ -28,7 +27,7 @@ from kcal.lens.camera_like import Unproject
 from scripts.bench import undistort
 from scripts.shared import wide_lens
 from scripts.shared.distorted import distort
-from scripts.shared.page import write_section
+from scripts.shared.sections import run, section
 from scripts.shared.timing import median, ratio, row, show, times
 
 SIZE = (1920, 1080)
@@ -220,23 +219,24 @@ def _points(camera: Camera, count: int) -> Tensor:
     return rays / rays[:, 2:] * depth
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few rounds, no more than 10 000 points")
-    parser.add_argument("--write", action="store_true", help="write the tables into docs/measured/lens.md")
-    arguments = parser.parse_args()
-    rounds, counts = (3, COUNTS[:2]) if arguments.quick else (15, COUNTS)
-    parts: dict[str, Callable[[], list[str]]] = {
-        "speed": lambda: throughput(rounds, counts),
-        "hybrid speed": lambda: hybrid_throughput(rounds, counts),
-        "accuracy": accuracy,
-        "no ray": honesty,
-        "images": lambda: undistort.tables(3 if arguments.quick else 30),
-    }
-    for name, made in parts.items():
-        lines = made()
-        write_section("lens.md", name, lines, write=arguments.write)
+@section("lens.md", "speed", rounds=1, points=COUNTS[:1])
+def speed(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> list[str]:
+    return throughput(rounds, points)
+
+
+@section("lens.md", "hybrid speed", rounds=1, points=COUNTS[:1])
+def hybrid_speed(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> list[str]:
+    return hybrid_throughput(rounds, points)
+
+
+section("lens.md", "accuracy")(accuracy)
+section("lens.md", "no ray")(honesty)
+
+
+@section("lens.md", "images", rounds=1)
+def images(rounds: int = 30) -> list[str]:
+    return undistort.tables(rounds)
 
 
 if __name__ == "__main__":
-    main()
+    run()

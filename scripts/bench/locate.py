@@ -8,9 +8,7 @@ faster. The statistics are simulations with fixed seeds and do not depend on the
 
 from __future__ import annotations
 
-import argparse
 import math
-from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -27,7 +25,7 @@ from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.localizer import Localizer
 from kcal.locate.tabulate import circular_error
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import write_section
+from scripts.shared.sections import run, section
 from scripts.shared.timing import median, ratio, row, show, times
 
 COUNTS = (100, 10_000, 1_000_000)
@@ -235,25 +233,25 @@ def geodesy() -> list[str]:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few rounds, no more than 10 000 points")
-    parser.add_argument("--write", action="store_true", help="write the tables into docs/measured/locate.md")
-    arguments = parser.parse_args()
-    rounds, counts = (3, COUNTS[:2]) if arguments.quick else (15, COUNTS)
-    draws = 4000 if arguments.quick else 40_000
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    parts: dict[str, Callable[[], list[str]]] = {
-        "coverage": lambda: coverage(draws),
-        "triangulation": lambda: throughput(rounds, counts),
-        "accuracy": lambda: [*accuracy(), "", *geodesy()],
-        "localizer": lambda: localizer(rounds, counts),
-    }
-    for name, made in parts.items():
-        lines = made()
-        write_section("locate.md", name, lines, write=arguments.write)
+@section("locate.md", "coverage", draws=400)
+def covered(draws: int = 40_000) -> list[str]:
+    return coverage(draws)
+
+
+@section("locate.md", "triangulation", rounds=1, points=COUNTS[:1])
+def triangulation(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> list[str]:
+    return throughput(rounds, points)
+
+
+@section("locate.md", "accuracy")
+def accurate() -> list[str]:
+    return [*accuracy(), "", *geodesy()]
+
+
+@section("locate.md", "localizer", rounds=1, points=COUNTS[:1])
+def localizers(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> list[str]:
+    return localizer(rounds, points)
 
 
 if __name__ == "__main__":
-    main()
+    run()

@@ -9,7 +9,6 @@ Lookup tables: size, stated bound, the largest error found at random points, and
 
 from __future__ import annotations
 
-import argparse
 import io
 import statistics
 import time
@@ -31,7 +30,7 @@ from kcal.lens.zernike import ZernikeModes
 from kcal.nets import InverseNetOptions, train_inverse
 from scripts.bench.lens import LENS, SIZE
 from scripts.bench.lens import build as build_hd
-from scripts.shared.page import write_section
+from scripts.shared.sections import run, section
 from scripts.shared.timing import ratio, row, show, spread, times
 
 PAGE = "lens.md"
@@ -199,19 +198,16 @@ def tables(rounds: int) -> list[str]:
     return lines
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--write", action="store_true", help=f"also write the sections of docs/{PAGE}")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    show(alone(arguments.seeds))
-    nets, lookup = as_start(arguments.rounds), tables(arguments.rounds)
-    if arguments.write:
-        write_section(PAGE, "inverse nets", nets)
-        write_section(PAGE, "lookup tables", lookup)
+@section("lens.md", "inverse nets", rounds=1, seeds=1)
+def inverse_nets(rounds: int = 15, seeds: int = 3) -> list[str]:
+    show(alone(seeds))
+    return as_start(rounds)
+
+
+@section("lens.md", "lookup tables", rounds=1)
+def lookup_tables(rounds: int = 15) -> list[str]:
+    return tables(rounds)
 
 
 if __name__ == "__main__":
-    main()
+    run()

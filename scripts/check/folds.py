@@ -12,7 +12,6 @@ and from the neighborhood of points that the lens turns over.
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import time
@@ -35,7 +34,8 @@ from kcal.lens.inverse import inverse_jacobian, newton_step, prepare_inverse, un
 from kcal.lens.projection import from_pixels
 from kcal.lens.region import DIRECTIONS, Region, direction_limits, in_region, sampled_region, valid_region
 from scripts.check.uncertainty import LENS
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.sections import run, section
 from scripts.shared.timing import show
 from scripts.shared.wide_lens import load
 
@@ -247,7 +247,7 @@ def calibrated() -> list[Camera]:
     ]
 
 
-def ordinary(count: int, seed: int) -> list[str]:
+def ordinary_lenses(count: int, seed: int) -> list[str]:
     """Valid pixels that ordinary cameras lose by the proof."""
     generator = np.random.default_rng(seed)
     groups: dict[str, tuple[list[Camera], int]] = {
@@ -292,22 +292,16 @@ def build_times(rounds: int) -> list[str]:
     return table(["model", "before the proof, ms", "now, ms", "now / before"], rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lenses", type=int, default=10_000)
-    parser.add_argument("--compared", type=int, default=1000, help="lenses that are also tried without the proof")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="most time for constructed lenses")
-    parser.add_argument("--ordinary", type=int, default=400, help="drawn at random; 0 leaves all ordinary ones out")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    text = constructed(arguments.lenses, arguments.seed, arguments.compared, arguments.minutes)
-    if arguments.ordinary:
-        text += ["", *ordinary(arguments.ordinary, arguments.seed)]
-    show(text)
+@section("lens.md", "folds", lenses=20, compared=5, ordinary=2)
+def folds(
+    lenses: int = 10_000, compared: int = 1000, minutes: float = math.inf, ordinary: int = 400, seed: int = 0
+) -> list[str]:
+    text = constructed(lenses, seed, compared, minutes)
+    if ordinary:
+        text += ["", *ordinary_lenses(ordinary, seed)]
     show(build_times(15))
-    write_section("lens.md", "folds", text, write=arguments.write)
+    return text
 
 
 if __name__ == "__main__":
-    main()
+    run()

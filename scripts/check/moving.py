@@ -12,7 +12,6 @@ minutes. Of the names of ships and aircraft 30 % are wrong. With --write the tab
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import time
@@ -25,7 +24,8 @@ from torch import Tensor
 from kcal import Baseline, Camera, KcalError, MeasuredPosition, RigData, solve_rig
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.locate.moving import CLOCK, MovingOptions, MovingTrack, Sighting, match_moving
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.sections import run, section
 
 CAMERA = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
 CENTERS = torch.tensor([[0.0, 0, 0], [10.0, 0, 0]], dtype=torch.float64)
@@ -218,20 +218,10 @@ HEADS = (
 )  # fmt: skip
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kinds", nargs="*", choices=(*KINDS, []), default=[])
-    parser.add_argument("--seeds", type=int, default=30)
-    parser.add_argument("--write", action="store_true")
-    given = parser.parse_args()
-    torch.set_num_threads(1)
-    rows = []
-    for name in given.kinds or KINDS:
-        rows.append(row_of(name, given.seeds))
-        print(rows[-1], flush=True)
-    lines = table(HEADS, rows)
-    tell("moving.md", "moving", lines, write=given.write)
+@section("moving.md", "moving", kinds=tuple(KINDS)[:1], seeds=1)
+def moving(kinds: tuple[str, ...] = tuple(KINDS), seeds: int = 30) -> list[str]:
+    return table(HEADS, [row_of(name, seeds) for name in kinds])
 
 
 if __name__ == "__main__":
-    main()
+    run()

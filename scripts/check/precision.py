@@ -9,7 +9,6 @@ against the exact value of the inputs that were not rounded. Lenses are drawn wi
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import math
 import tempfile
@@ -29,7 +28,8 @@ from kcal.lens import bake, rotation_from_vector, save_onnx, undistort_maps
 from kcal.lens.views import new_pinhole
 from kcal.locate import Triangulate, enu_to_geodetic, geodetic_to_enu
 from kcal.stars.sky import Air, StarCatalog, observed_directions
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.sections import run, section
 
 Numbers = Sequence[mpf]
 SIZE = (1920, 1080)
@@ -336,21 +336,28 @@ def limit_rows() -> list[list[str]]:
     ]  # fmt: skip
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--points", type=int, default=200, help="points for each lens; fewer where a step is slow")
-    parser.add_argument("--write", action="store_true", help="write the tables into docs/measured/precision.md")
-    given = parser.parse_args()
-    head = ["quantity", "largest error, float64", "inputs of float32"]
-    sections = {
-        "lens precision": lambda: table(head, lens_rows(given.points)),
-        "stored precision": lambda: table(head, table_rows(given.points)),
-        "position precision": lambda: table(head, pair_rows(given.points) + geodesy_rows(given.points) + star_rows()),
-        "limits": lambda: table(["what is asked", "answer"], limit_rows()),
-    }
-    for name, make in sections.items():
-        tell("precision.md", name, make(), write=given.write)
+HEAD = ["quantity", "largest error, float64", "inputs of float32"]
+
+
+@section("precision.md", "lens precision", points=20)
+def lens_precision(points: int = 200) -> list[str]:
+    return table(HEAD, lens_rows(points))
+
+
+@section("precision.md", "stored precision", points=20)
+def stored_precision(points: int = 200) -> list[str]:
+    return table(HEAD, table_rows(points))
+
+
+@section("precision.md", "position precision", points=20)
+def position_precision(points: int = 200) -> list[str]:
+    return table(HEAD, pair_rows(points) + geodesy_rows(points) + star_rows())
+
+
+@section("precision.md", "limits")
+def limits() -> list[str]:
+    return table(["what is asked", "answer"], limit_rows())
 
 
 if __name__ == "__main__":
-    main()
+    run()

@@ -12,7 +12,6 @@ Error without noise: neither survey nor marks have any, so that only the coeffic
 
 from __future__ import annotations
 
-import argparse
 from typing import NamedTuple
 
 import torch
@@ -23,7 +22,8 @@ from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA
 from kcal.locate.geodesy import enu_from_cam, mean_radius
 from kcal.rig import placed_rig
 from scripts.shared.long_range import ORIGIN, rig
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.sections import run, section
 
 COUNT, SURVEY, MARK = 12, 0.02, 0.07  # landmarks; meters, px
 TARGET_RANGE = 5000.0
@@ -130,16 +130,11 @@ def rows(draws: int) -> list[list[str]]:
     return out
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=40, help="of landmarks, targets and noise")
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    head, *body = rows(arguments.draws)
-    lines = table(head, body)
-    tell("rig.md", "refraction", lines, write=arguments.write)
+@section("rig.md", "refraction", draws=2)
+def refraction(draws: int = 40) -> list[str]:
+    head, *body = rows(draws)
+    return table(head, body)
 
 
 if __name__ == "__main__":
-    main()
+    run()

@@ -9,10 +9,8 @@ made.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -26,7 +24,8 @@ from kcal.report import rig_figure, save_picture
 from kcal.rig import RigCovariance
 from kcal.watch.turned import drift_of_turns, measure_drift
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import DOCS, write_section
+from scripts.shared.page import DOCS
+from scripts.shared.sections import run, section
 from scripts.shared.timing import row, show
 
 HEADING = 35.0
@@ -295,23 +294,26 @@ def example(path: Path) -> None:
     save_picture(path, rig_figure(solve_rig(sources, STRAIGHT)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few repetitions")
-    parser.add_argument("--write", action="store_true", help="write the tables of docs/measured/rig.md and its picture")
-    arguments = parser.parse_args()
-    draws, marks = (20, 50) if arguments.quick else (100, 50)
-    parts: dict[str, Callable[[], list[str]]] = {
-        "coverage": lambda: coverage(draws, marks),
-        "wrong landmark": lambda: wrong(draws // 2),
-        "turned": lambda: drift(draws // 2),
-    }
-    for name, made in parts.items():
-        lines = made()
-        write_section("rig.md", name, lines, write=arguments.write)
-    if arguments.write:
+@section("rig.md", "coverage", draws=2)
+def coverage_rows(draws: int = 100) -> list[str]:
+    return coverage(draws, 50)
+
+
+@section("rig.md", "wrong landmark", draws=4)
+def wrong_landmark(draws: int = 100) -> list[str]:
+    return wrong(draws // 2)
+
+
+@section("rig.md", "turned", draws=4)
+def turned(draws: int = 100) -> list[str]:
+    return drift(draws // 2)
+
+
+@section("rig.md", "picture")
+def picture(write: bool = False) -> None:
+    if write:
         example(DOCS / "rig.png")
 
 
 if __name__ == "__main__":
-    main()
+    run()

@@ -10,7 +10,6 @@ other program's projection. σ is the largest error of a standard deviation, rel
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 from collections.abc import Callable, Iterator
@@ -37,7 +36,8 @@ from scripts.check.exchange import (
     random_points,
     sample_camera,
 )
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.sections import run, section
 
 HEADS = ["program", "direction", "lens", "σ", "pupil", "board", "largest error, px", "reader"]
 K, D = np.array([[1000.1, 0, 640.3], [0, 1001.3, 359.2], [0, 0, 1]]), np.array([-0.2, 0.05, 1e-3, -2e-3, 0.01])
@@ -272,15 +272,11 @@ def in_rows(folder: Path, mrcal: str | None) -> Iterator[Row]:
         yield [program, "in", lens, deviation, "no", "no", f"{error:.0e}", reader]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mrcal", metavar="PYTHON")
-    parser.add_argument("--write", action="store_true", help="write the table into docs/measured/other-programs.md")
-    args = parser.parse_args()
+@section("other-programs.md", "round trips")
+def round_trips(mrcal: str = "") -> list[str]:
     with tempfile.TemporaryDirectory() as name:
-        rows = [*out_rows(Path(name), args.mrcal), *in_rows(Path(name), args.mrcal)]
-    tell("other-programs.md", "round trips", table(HEADS, rows), write=args.write)
+        return table(HEADS, [*out_rows(Path(name), mrcal or None), *in_rows(Path(name), mrcal or None)])
 
 
 if __name__ == "__main__":
-    main()
+    run()

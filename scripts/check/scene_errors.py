@@ -9,7 +9,6 @@ in every pair of that light. Weights are those of noise and of 0.08 px. With --w
 
 from __future__ import annotations
 
-import argparse
 import math
 from typing import NamedTuple
 
@@ -24,8 +23,8 @@ from kcal.scene.common_errors import line_errors
 from kcal.scene.match import guided_matches
 from kcal.scene.refine import refine_matches
 from scripts.check.scene import HALF, WRONG, exact, rig_of
-from scripts.shared.page import table, tell
-from scripts.shared.records import seeds
+from scripts.shared.page import table
+from scripts.shared.sections import run, section
 from scripts.shared.terrain import Terrain, Weather
 
 KINDS = ("level ground", "hills and walls", "edges before something farther")
@@ -106,15 +105,10 @@ def rows(found: list[Errors]) -> list[list[str]]:
 HEADS = ("what", "matches", "RMS, px", "σ of noise", "of it repeats, RMS", "median", "yaw, RMS", "yaw, mean")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="700-711")
-    parser.add_argument("--write", action="store_true")
-    given = parser.parse_args()
-    torch.set_num_threads(1)
-    found = [errors_of(seed) for seed in seeds(given.seeds)]
-    tell("scene.md", "repeats", table(HEADS, rows(found)), write=given.write)
+@section("scene.md", "repeats", seeds=range(700, 701))
+def repeats(seeds: range = range(700, 712)) -> list[str]:
+    return table(HEADS, rows([errors_of(seed) for seed in seeds]))
 
 
 if __name__ == "__main__":
-    main()
+    run()

@@ -15,7 +15,6 @@ made.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import tempfile
@@ -34,9 +33,10 @@ from kcal.lens import LensSetting
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.sim.raytrace import Misalignment, focal_length, system_matrix
 from kcal.sim.truth import TruthLens
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
 from scripts.shared.prescriptions import MACHINE_VISION
 from scripts.shared.records import Record, finish
+from scripts.shared.sections import run, section
 from scripts.shared.traced import BOARD, captures, printed
 
 LENS = MACHINE_VISION
@@ -186,22 +186,14 @@ def lines(records: list[Record], noises: int) -> list[str]:
     return table(heads, rows)
 
 
-def main() -> None:
-    """Run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kinds", nargs="*", default=["zoom", "focus"])
-    parser.add_argument("--lenses", type=int, default=10)
-    parser.add_argument("--noises", type=int, default=3)
-    parser.add_argument("--records", type=Path, default=Path(tempfile.gettempdir(), "kcal-settings"))
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
-    keys = [(kind, seed, options.noises) for seed in range(options.lenses) for kind in options.kinds]
-    records = finish(options.records / "settings.jsonl", keys, work, shown)
+@section("settings.md", "settings", lenses=1, noises=1)
+def settings(kinds: tuple[str, ...] = ("zoom", "focus"), lenses: int = 10, noises: int = 3) -> list[str]:
+    keys = [(kind, seed, noises) for seed in range(lenses) for kind in kinds]
+    records = finish(Path(tempfile.gettempdir(), "kcal-settings", "settings.jsonl"), keys, work, shown)
     wanted = [list(key) for key in keys]
     found = sorted((one for one in records if one["key"] in wanted), key=lambda one: wanted.index(one["key"]) % 2)
-    text = lines(found, options.noises)
-    tell("settings.md", "settings", text, write=options.write)
+    return lines(found, noises)
 
 
 if __name__ == "__main__":
-    main()
+    run()

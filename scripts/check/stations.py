@@ -25,12 +25,11 @@ standard deviations.
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +39,8 @@ from torch import Tensor
 from kcal import Camera, Localizer, Rig
 from kcal.locate import Triangulate
 from kcal.locate.stereo import Localization, PositionStatus
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.sections import run, section
 from scripts.shared.station_scenes import drawn_errors, marks, ring, targets
 from scripts.shared.timing import show
 
@@ -360,26 +360,32 @@ def picture() -> None:
     show([str(save_picture(path, stations_figure(located, points)))])
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one part."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=("peers", "coverage", "smoke", "real", "picture"))
-    parser.add_argument("count", nargs="?", type=int)
-    parser.add_argument("--write", action="store_true")
-    given = parser.parse_args(arguments)
-    torch.set_num_threads(1)
-    if given.part == "picture":
-        picture()
-        return
+@section("stations.md", "peers", count=200)
+def peers(count: int = 20_000) -> list[str]:
     with torch.no_grad():
-        lines = {
-            "peers": lambda: compare(1, given.count or 20_000),
-            "coverage": lambda: coverage(given.count or 20_000),
-            "smoke": lambda: smoke(given.count or 2000),
-            "real": real,
-        }[given.part]()
-    tell("stations.md", given.part, lines, write=given.write)
+        return compare(1, count)
+
+
+@section("stations.md", "coverage", count=200)
+def covered(count: int = 20_000) -> list[str]:
+    with torch.no_grad():
+        return coverage(count)
+
+
+@section("stations.md", "smoke", fires=20)
+def smokes(fires: int = 2000) -> list[str]:
+    with torch.no_grad():
+        return smoke(fires)
+
+
+section("stations.md", "real")(torch.no_grad()(real))
+
+
+@section("stations.md", "picture")
+def drawn(write: bool = False) -> None:
+    if write:
+        picture()
 
 
 if __name__ == "__main__":
-    main()
+    run()
