@@ -292,7 +292,7 @@ def build_times(rounds: int) -> list[str]:
     return table(["model", "before the proof, ms", "now, ms", "now / before"], rows)
 
 
-@section("lens.md", "folds", lenses=20, compared=5, ordinary=2)
+@section("lens.md", "folds", lenses=3, compared=1, ordinary=0)
 def folds(
     lenses: int = 10_000, compared: int = 1000, minutes: float = math.inf, ordinary: int = 400, seed: int = 0
 ) -> list[str]:
