@@ -317,8 +317,8 @@ def own_lenses(
     views = _of_fit(fit, pixels, torch.zeros_like(pixels[:, 0, :1]).expand(-1, _SIZE))
     if not bool(views.N.isfinite().all() and views.g.isfinite().all()):
         return None
-    found, none = _likeliest(views, _LENS), views.spread(_NONE)
-    if views.spread(_BENT).nats > max(found.nats, none.nats):
+    found, none, bent = _likeliest(views, _LENS), views.spread(_NONE), views.spread(_BENT)
+    if bent.beyond(none) >= 0.0 and bent.nats > found.nats:
         return None
     refits, about, normal, nats = _Refits(fit, seen, pixels, options, progress), views.lens(), None, 0.0
     if found.beyond(none) < 0.0:

@@ -253,10 +253,10 @@ def test_two_webcams_that_are_not_synchronized(kcal_data: Path) -> None:
         assert "taken at the same moment" in result.warnings[0]
         moved = [float(text.split("by some ")[1].split()[0]) for text in result.warnings if "rolling" in text]
         assert max(moved) < 1.0
-        assert result.sigma_corner == pytest.approx(0.06, abs=0.01)
+        assert result.sigma_corner == pytest.approx(0.04, abs=0.01)  # of corners, each at its own place
     zoomed = cameras[1].params.detach().clone()
     zoomed[:2] *= 2.0
     other = cameras[1].with_parameters(zoomed)
     other.calibration = CameraCalibration(record=cameras[1].calibration.record)
-    with pytest.raises(InputError, match=r"do not fit the right camera \(RMS .* px; 0\.08 px when it was calibrated\)"):
+    with pytest.raises(InputError, match=r"do not fit the right camera \(RMS .* px; 0\.054 px when it was calibrated\)"):
         calibrate_rig(cameras[0], other, *seen, pairs)
