@@ -18,6 +18,7 @@ import dataclasses
 import itertools
 import math
 import statistics
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -171,7 +172,10 @@ def main() -> None:
     parser.add_argument("--noises", nargs="+", type=float, default=NOISES, help="pixels")
     parser.add_argument("--real", action="store_true", help="the pairs of cameras in KCAL_DATA")
     parser.add_argument(
-        "--cache", type=Path, default=Path("/tmp/kcal-ordinary-corners"), help="corners found in images"
+        "--cache",
+        type=Path,
+        default=Path(tempfile.gettempdir(), "kcal-ordinary-corners"),
+        help="corners found in images",
     )
     parser.add_argument("--write", action="store_true", help="write the tables into the page")
     arguments = parser.parse_args()
