@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import orjson
 
 from kcal.errors import with_extra
 
@@ -50,9 +50,7 @@ def arrow_table(columns: Mapping[str, Any], about: Mapping[str, Mapping[str, Any
         # Stated, for a column in which all is unknown has no type of its own.
         kind = None if isinstance(values, np.ndarray) else pyarrow.string() if name not in WKB else pyarrow.binary()
         made[name] = pyarrow.array(values, kind, from_pandas=True)
-    return pyarrow.table(made).replace_schema_metadata(
-        {key: orjson.dumps(value) for key, value in (about or {}).items()}
-    )
+    return pyarrow.table(made).replace_schema_metadata({key: json.dumps(value) for key, value in (about or {}).items()})
 
 
 def wkb_points(coordinates: np.ndarray) -> list[bytes | None]:

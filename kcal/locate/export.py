@@ -293,7 +293,7 @@ _TAKEN = {"kind", *TEXTS, *NUMBERS}
 
 
 class _Format(NamedTuple):
-    """How a file is made: its beginning, a text for each chunk, and its end.
+    """How a file is made: its beginning, a text for each chunk, and its end; nothing where another library writes it.
 
     Attributes:
         start: the beginning; of a table it names the columns.
@@ -302,8 +302,8 @@ class _Format(NamedTuple):
         end: the end.
     """
 
-    start: Callable[[Located, PositionColumns], bytes]
-    rows: Callable[[Located, PositionColumns, datetime], bytes]
+    start: Callable[[Located, PositionColumns], bytes] = lambda run, columns: b""
+    rows: Callable[[Located, PositionColumns, datetime], bytes] = lambda run, columns, time: b""
     later: Callable[[Located, PositionColumns], bytes] | None = None
     end: bytes = b""
 
@@ -386,9 +386,9 @@ class _Parquet:
         self._writer: Any = None
 
     def add(self, run: Located, columns: PositionColumns) -> None:
+        table = position_table(columns, run)  # it says what to install
         from pyarrow.parquet import ParquetWriter
 
-        table = position_table(columns, run)
         self._writer = self._writer or ParquetWriter(self._file, table.schema)
         self._writer.write_table(table)
 
@@ -483,8 +483,9 @@ class PositionWriter:
     def __init__(self, file: BinaryIO, suffix: str, run: Located) -> None:
         check_place(f"positions{suffix}", run)
         self._file, self._run = file, run
-        self._table = _TABLES[suffix.lower()](file) if suffix.lower() in _TABLES else None
-        self._format = _FORMATS[".csv" if self._table else suffix.lower()]
+        table = _TABLES.get(suffix.lower())
+        self._table = table(file) if table else None
+        self._format = _Format() if table else _FORMATS[suffix.lower()]
         self._later = tempfile.TemporaryFile() if self._format.later is not None else None  # noqa: SIM115
         self._started = False
         self._time = datetime.now(UTC)
@@ -495,8 +496,7 @@ class PositionWriter:
             taken = [name for name in columns.extras if name in _TAKEN or name.endswith("_infinite")]
             if taken:
                 raise InputError(f"the table has a column {taken[0]!r}, as positions have; give it another name")
-            if not self._table:
-                self._file.write(self._format.start(self._run, columns))
+            self._file.write(self._format.start(self._run, columns))
             self._started = True
         if self._table:
             self._table.add(self._run, columns)

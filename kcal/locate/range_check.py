@@ -189,8 +189,9 @@ def check_ranges(
     plane = torch.linalg.qr(torch.stack(weighed, 1))[0]
     part = float((plane.T @ unexplained).square().sum())
     degrees, others = plane.shape[1], len(names) - plane.shape[1]
-    common = float(chi2_of.sf(part, degrees))
-    rest = float(chi2_of.sf(chi2 - part, others)) if others else math.nan
+    common = _chance(part, degrees)
+    rest = _chance(chi2 - part, others) if others else math.nan
+    chance = min(common, rest) if others else common
     causes = [_shift(name, unexplained, slope) for name, slope in zip(slopes, weighed, strict=True)]
     causes.append(_noisier(covariance, error))
     causes.sort(key=lambda cause: -cause.sigmas)
@@ -199,17 +200,17 @@ def check_ranges(
     measured, low, high = (torch.where(value > 0, 1.0 / value, math.inf) for value in (inverse, *ends))
     smallest = 1.0 - (1.0 - level) ** (0.5 if others else 1.0)
     findings = []
-    if min(common, 1.0 if math.isnan(rest) else rest) < smallest:
+    if chance < smallest:
         ratio = float((inverse * ranges).median())
         if not 1.0 / _ABSURD < ratio < _ABSURD and bool((error.abs() > 10.0 * deviation).all()):
             raise InputError(
                 f"ranges by the rig are {1.0 / ratio if ratio > 0 else math.inf:.3g} times the known ones: are these "
                 "meters from the left camera, and of the same points?"
             )
-        findings.append(_contradiction(causes, min(common, rest if others else 1.0)))
+        findings.append(_contradiction(causes, chance))
     return RangeCheck(
         names=names, known=ranges, measured=measured, low=low, high=high, pulls=error / deviation, chi2=chi2,
-        probability=float(chi2_of.sf(chi2, len(names))), common=common, rest=rest, causes=tuple(causes),
+        probability=_chance(chi2, len(names)), common=common, rest=rest, causes=tuple(causes),
         findings=tuple(findings),
     )  # fmt: skip
 

@@ -106,7 +106,8 @@ def test_a_rig_without_a_place_has_parquet_but_no_geopackage(tmp_path: Path) -> 
 
 def test_without_pyarrow_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     run = located()
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    for name in ("pyarrow", "pyarrow.parquet"):
+        monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(InputError, match=r"pip install 'kcal\[tables\]'"):
         run.to_arrow()
     path = tmp_path / "p.parquet"

@@ -14,6 +14,7 @@ from torch import Tensor
 from kcal.calibrate.hybrid.board_modes import CLEAR, find_turns, turned, turned_corner_offsets, turned_corners
 from kcal.calibrate.hybrid.evidence import Quadratic, negative_log_evidence
 from kcal.calibrate.hybrid.families import (
+    BEFORE_LENS,
     BOARD,
     Hyperprior,
     LensPrior,
@@ -106,7 +107,7 @@ def typical_lens(form: HybridForm, families: PriorFamilies, h: Tensor, square: b
         h: (H,).
         square: whether pixels are square.
     """
-    count = 3 + len(form.names) + (0 if square else 1)
+    count = BEFORE_LENS + len(form.names) + (0 if square else 1)
     mean, sd = families.mean[:count].clone(), families.deviation(h)[:count].clone()
     sd[0] = _FOCAL * mean[0]
     if not square:

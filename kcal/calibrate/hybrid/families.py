@@ -23,6 +23,8 @@ _SD = np.array([2.0, 1.5, 1.5, 1.5, 1.5, 1.5])
 BOARD = -5
 # Unknowns before the field's weights: focal length, principal point, shape, pupil; where the pupil stands among them.
 LEADING_UNKNOWNS, PUPIL = 6, slice(4, 6)
+# Those before the coefficients of the lens: focal length and principal point.
+BEFORE_LENS = 3
 # Unequal and skewed axes, in units of R: pixels are square.
 SQUARE = 1e-4
 # Of a focal length about that of the base projection, as a share of it: views that leave it open still tell it to no
@@ -130,7 +132,7 @@ class LensPrior(NamedTuple):
     @property
     def square(self) -> bool:
         """Whether pixels are square."""
-        return len(self.unknowns.mean) == 3 + len(self.form.names)
+        return len(self.unknowns.mean) == BEFORE_LENS + len(self.form.names)
 
     def families(self, usual: PriorFamilies) -> PriorFamilies:
         """The usual priors with those of the lens replaced by these."""

@@ -16,6 +16,7 @@ from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import STRETCH, BoardModes, board_modes
 from kcal.calibrate.hybrid.evidence import WORTH, Amplitudes, posterior_root
 from kcal.calibrate.hybrid.families import (
+    BEFORE_LENS,
     BOARD,
     PUPIL,
     LensPrior,
@@ -550,14 +551,14 @@ def fit_hybrid(
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
     assert model.hybrid is not None
     peaks = torch.tensor(model.hybrid.modes.peaks, dtype=torch.float64)
-    first = 3 + len(model.hybrid.leading)
+    first = BEFORE_LENS + len(model.hybrid.leading)
     field = slice(first, first + len(peaks))
     unfelt = families.deviation(h)[field] * float(state.parameters[0]) * peaks < _UNFELT
     held = capture.held(estimate)
     held[field] |= unfelt
     if bool(unfelt.any()):
         parameters = state.parameters.clone()
-        parameters[2 + first :][unfelt] = families.mean[field][unfelt]
+        parameters[len(INTRINSICS) + len(model.hybrid.leading) :][unfelt] = families.mean[field][unfelt]
         estimate = estimate._replace(state=state._replace(parameters=parameters))
     problem, estimate, steps = capture.solved(estimate, LAST, last_step=True, held=held)
     reduced, displaced = problem.reduced_rows(estimate.state), None if known is None else known.corners

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, jacrev, vmap
 
+from kcal.calibrate.hybrid.families import BEFORE_LENS
 from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews, Rounds, run_rounds
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.errors import InputError
@@ -141,7 +142,7 @@ def _with_weights(estimate: Estimate, weights: Tensor) -> Estimate:
             part.copy_(values)
     modes = NetworkModes(trunk, vector=form.modes.vector)
     degree = estimate.families.degree.clone()
-    first = len(form.leading) + 3
+    first = BEFORE_LENS + len(form.leading)
     degree[first : first + len(modes)] = torch.tensor([p.degree for p in modes.weight_priors])
     model = LensModel(hybrid=dataclasses.replace(form, modes=modes))
     return estimate._replace(model=model, families=estimate.families._replace(degree=degree))
