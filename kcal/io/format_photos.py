@@ -18,7 +18,7 @@ import torch
 import kcal.io.foreign as foreign
 from kcal.errors import InputError
 from kcal.files import dump_json, read_bytes, read_text, write_atomic
-from kcal.io.format_kalibr import central_camera
+from kcal.io.foreign_lenses import LENSES, ForeignCamera, as_written, foreign_camera
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
@@ -31,7 +31,8 @@ from kcal.strict_json import read_json, read_xml
 #     y' = y (1 + ...) + p2 (r² + 2y²) + 2 p1 x y,                            v = height / 2 + cy + y' f
 #
 # Pixel (0.5, 0.5) is the center of the first pixel there. p1 and p2 are OpenCV's p2 and p1 (Metashape's manual,
-# appendix D). A fisheye has θ in place of r = tan θ.
+# appendix D). A fisheye has θ in place of r = tan θ. Older versions multiply the terms of p1 and p2 by
+# 1 + p3 r² + p4 r⁴.
 
 # What of kcal's parameters changes with each of Metashape's.
 _FRAME = {"f": ("fx", "fy"), "b1": ("fx",), "b2": ("skew",), "cx": ("cx",), "cy": ("cy",), "p1": ("p2",), "p2": ("p1",),
@@ -44,15 +45,15 @@ def read_agisoft(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read the adjusted calibration of every sensor; poses are in a frame of the chunk and not read."""
     root = read_xml(read_bytes(path, foreign.MOST_BYTES), str(path))
     sensors = [part for part in root.iter("sensor") if part.find("calibration") is not None] or [root]
+    notes = ["the poses of images are not read"] if root.find(".//camera/transform") is not None else []
     cameras, unread = foreign.each_readable(
-        (part.get("label") or f"sensor {number}", partial(_agisoft_camera, part, number))
+        (part.get("label") or f"sensor {number}", partial(_agisoft_camera, part, number, notes))
         for number, part in enumerate(sensors)
     )
-    notes = ("the poses of images are not read",) if root.find(".//camera/transform") is not None else ()
-    return foreign.ImportedCameras(format="agisoft", cameras=cameras, notes=notes, unread=unread)
+    return foreign.ImportedCameras(format="agisoft", cameras=cameras, notes=tuple(notes), unread=unread)
 
 
-def _agisoft_camera(sensor: Element, number: int) -> Camera:
+def _agisoft_camera(sensor: Element, number: int, notes: list[str]) -> Camera:
     name = sensor.get("label") or f"sensor {sensor.get('id', number)}"
     found = [sensor] if sensor.tag == "calibration" else sensor.findall("calibration")
     if not found:
@@ -68,9 +69,6 @@ def _agisoft_camera(sensor: Element, number: int) -> Camera:
     else:
         width, height = foreign.whole_size(best.findtext("width"), best.findtext("height"))
     given = {tag: foreign.numbers([best.findtext(tag, "0")], 1, tag)[0] for tag in (*_FRAME, *_OTHERS)}
-    strange = [tag for tag, value in given.items() if value and tag not in own]
-    if strange:
-        raise ValueError(f"{name}: {', '.join(strange)} of a {kind} lens: no lens of kcal holds it")
     if kind == "fisheye":
         model = LensModel.named("fisheye4")
     else:
@@ -82,8 +80,14 @@ def _agisoft_camera(sensor: Element, number: int) -> Camera:
             if target in values:
                 values[target] += given[tag]
     fx, fy, cx, cy, skew, *lens = values.values()
-    center = cx + 0.5 * width - 0.5, cy + 0.5 * height - 0.5
-    camera = foreign.named_camera(name, (fx, fy, *center), (width, height), model, lens, skew)
+    core = (fx, fy, cx + 0.5 * width - 0.5, cy + 0.5 * height - 0.5)
+    if any(value for tag, value in given.items() if tag not in own):
+        kind = "fisheye with p1 to p4" if kind == "fisheye" else "frame with p3, p4"
+        terms = [given[tag] for tag in LENSES[kind].names]
+        camera, note = foreign_camera(kind, name, core, (width, height), terms, skew)
+        notes.append(note if sensor.find("covariance") is None else f"{note}; its error bars are not kept")
+        return camera
+    camera = foreign.named_camera(name, core, (width, height), model, lens, skew)
     covariance = _sensor_covariance(sensor, own, names)
     if covariance is not None:
         camera.calibration = CameraCalibration(name=name, covariance=covariance)
@@ -115,7 +119,7 @@ _HALF = 0.5
 
 
 class ColmapModel(NamedTuple):
-    """A model of COLMAP: its number in binary files, the names of its parameters, and kcal's model."""
+    """A model of COLMAP: its number in binary files, the names of its parameters, and kcal's model or foreign lens."""
 
     number: int
     parameters: tuple[str, ...]
@@ -135,20 +139,19 @@ COLMAP_MODELS = {
     "RADIAL_FISHEYE": ColmapModel(9, ("f", *_CENTER, "k1", "k2"), "fisheye4"),
     "SIMPLE_FISHEYE": ColmapModel(14, ("f", *_CENTER), "fisheye4"),
     "FISHEYE": ColmapModel(15, _TWO, "fisheye4"),
-    # Those that become hybrid lenses.
+    # Those that become hybrid lenses; the names are those of `LENSES`.
     "FOV": ColmapModel(7, (*_TWO, "omega"), "fov"),
-    "THIN_PRISM_FISHEYE": ColmapModel(
-        10,
-        (*_TWO, "k1", "k2", "p1", "p2", "k3", "k7", "s1", "s3"),
-        "theta",  # kcal's names: k4 is a denominator's
-    ),
+    "THIN_PRISM_FISHEYE": ColmapModel(10, (*_TWO, "k1", "k2", "p1", "p2", "k3", "k4", "s0", "s2"), "fisheye624"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ColmapModel(11, (*_TWO, *LENSES["rad-tan-thin-prism"].names), "rad-tan-thin-prism"),
     "SIMPLE_DIVISION": ColmapModel(12, ("f", *_CENTER, "k"), "division"),
     "DIVISION": ColmapModel(13, (*_TWO, "k"), "division"),
-    "EUCM": ColmapModel(-1, (*_TWO, "alpha", "beta"), "eucm"),
-    # Known, so that other cameras of a binary file can be read, and held by no lens of kcal.
-    "RAD_TAN_THIN_PRISM_FISHEYE": ColmapModel(11, (*_TWO, *(f"c{i}" for i in range(12))), ""),
+    "EUCM": ColmapModel(16, (*_TWO, "alpha", "beta"), "eucm"),
+    # Known, so that other cameras of a binary file can be read; a panorama is no camera of kcal.
+    "EQUIRECTANGULAR": ColmapModel(17, ("w", "h"), ""),
 }
-WRITTEN = {"pinhole": "PINHOLE", "opencv4": "OPENCV", "opencv8": "FULL_OPENCV", "fisheye4": "OPENCV_FISHEYE"}
+WRITTEN = {"pinhole": "PINHOLE", "opencv4": "OPENCV", "opencv8": "FULL_OPENCV", "fisheye4": "OPENCV_FISHEYE",
+           "fov": "FOV", "division": "DIVISION", "eucm": "EUCM",
+           "rad-tan-thin-prism": "RAD_TAN_THIN_PRISM_FISHEYE"}  # fmt: skip
 
 
 def read_colmap(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
@@ -169,12 +172,9 @@ def _colmap_camera(number: int, name: str, size: tuple[int, int], values: Sequen
     fx = given.pop("fx", None) or given["f"]
     fy = given.pop("fy", None) or given.pop("f")
     cx, cy = given.pop("cx") - _HALF, given.pop("cy") - _HALF
-    if known.model in ("fov", "theta", "division", "eucm"):
-        lens = (
-            LensModel(numerator=4, tangential=True, prism=1) if known.model == "theta" else LensModel.named("pinhole")
-        )
-        inner = foreign.named_camera(str(number), (fx, fy, cx, cy), size, lens, [given[name] for name in lens.names])
-        camera, note = central_camera(known.model, inner, [given[name] for name in given if name not in lens.names])
+    if known.model in LENSES:
+        own = [given.get(name, 0.0) for name in LENSES[known.model].names]
+        camera, note = foreign_camera(known.model, str(number), (fx, fy, cx, cy), size, own)
         notes.append(note)
         return camera
     # What is left are coefficients, and kcal has the same names in the same order.
@@ -227,12 +227,12 @@ def _from_binary(data: bytes) -> list[tuple[int, str, tuple[int, int], list[floa
     return entries
 
 
-def write_colmap(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
+def write_colmap(cameras: Sequence[Camera | ForeignCamera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write the cameras, numbered from 1, as text or, for the suffix .bin, in binary."""
     entries = []
     for number, camera in enumerate(cameras, 1):
-        fx, fy, cx, cy, _, *lens = camera.params.tolist()
-        entries.append((number, WRITTEN[str(camera.model)], camera.size, [fx, fy, cx + _HALF, cy + _HALF, *lens]))
+        _, kind, (fx, fy, cx, cy, _, *lens) = as_written(camera)
+        entries.append((number, WRITTEN[kind], camera.size, [fx, fy, cx + _HALF, cy + _HALF, *lens]))
     if path.suffix.lower() == ".bin":
         data = struct.pack("<Q", len(entries))
         for number, name, size, values in entries:
@@ -344,7 +344,7 @@ def write_nerfstudio(cameras: Sequence[Camera], poses: Sequence[Pose], path: Pat
 
 # OpenSfM's and OpenDroneMap's `camera_models.json` and `cameras.json`: lengths in units of the image's longer side.
 
-# Coefficients by projection type, in kcal's order, and kcal's model.
+# Coefficients by projection type, in kcal's order, and kcal's model or foreign lens.
 _OPENSFM_LENSES = {
     "perspective": (("k1", "k2"), "opencv4"),
     "simple_radial": (("k1",), "opencv4"),
@@ -352,6 +352,9 @@ _OPENSFM_LENSES = {
     "brown": (("k1", "k2", "p1", "p2", "k3"), "opencv5"),
     "fisheye": (("k1", "k2"), "fisheye4"),
     "fisheye_opencv": (("k1", "k2", "k3", "k4"), "fisheye4"),
+    "fisheye62": (LENSES["fisheye624"].names[:8], "fisheye624"),
+    "fisheye624": (LENSES["fisheye624"].names, "fisheye624"),
+    "dual": (LENSES["dual"].names, "dual"),
 }
 
 
@@ -363,13 +366,14 @@ def read_opensfm(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     content = content.get("cameras", content)
     if not content:
         raise ValueError("no cameras")
+    notes: list[str] = []
     cameras, unread = foreign.each_readable(
-        (name, partial(_opensfm_camera, name, foreign.Keys(value))) for name, value in content.items()
+        (name, partial(_opensfm_camera, name, foreign.Keys(value), notes)) for name, value in content.items()
     )
-    return foreign.ImportedCameras(format="opensfm", cameras=cameras, unread=unread)
+    return foreign.ImportedCameras(format="opensfm", cameras=cameras, notes=tuple(notes), unread=unread)
 
 
-def _opensfm_camera(name: str, value: foreign.Keys) -> Camera:
+def _opensfm_camera(name: str, value: foreign.Keys, notes: list[str]) -> Camera:
     kind = str(value["projection_type"])
     if kind not in _OPENSFM_LENSES:
         raise ValueError(f"{name}: projection_type {kind}: kcal reads {', '.join(_OPENSFM_LENSES)}")
@@ -383,18 +387,22 @@ def _opensfm_camera(name: str, value: foreign.Keys) -> Camera:
     )
     lens = [float(value.get(key, 0.0)) for key in names]
     value.rest()
-    return foreign.named_camera(name, (fx, fy, cx, cy), size, model, lens)
+    if model not in LENSES:
+        return foreign.named_camera(name, (fx, fy, cx, cy), size, model, lens)
+    camera, note = foreign_camera(model, name, (fx, fy, cx, cy), size, lens)
+    notes.append(note)
+    return camera
 
 
-def write_opensfm(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
+def write_opensfm(cameras: Sequence[Camera | ForeignCamera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write all cameras, by their names."""
     content: dict[str, Any] = {}
     for i, camera in enumerate(cameras):
-        fx, fy, cx, cy = camera.params[:4].tolist()
+        name, model, (fx, fy, cx, cy, _, *values) = as_written(camera, f"camera {i}")
         (width, height), longer = camera.size, max(camera.size)
-        lens = dict(zip(camera.model.names, camera.coefficients.tolist(), strict=True))
-        kind = "fisheye_opencv" if camera.model.fisheye else "brown"
-        content[foreign.camera_name(camera, f"camera {i}")] = {
+        kind = {"fisheye4": "fisheye_opencv", "fisheye624": "fisheye624"}.get(model, "brown")
+        lens = dict(zip(_OPENSFM_LENSES[kind][0], values, strict=False))
+        content[name] = {
             "projection_type": kind,
             "width": width,
             "height": height,

@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -50,20 +51,25 @@ class CameraFormat:
         suffixes: of file names that mean this format where nothing else is said.
         write: cameras and their poses, all of one of the models; None for formats that kcal only reads.
         skew: whether it can hold a skew.
-        pose: whether it can hold the relative pose of two cameras.
+        poses: of how many cameras it can hold the relative poses.
         prior: whether it is a file of priors, which has the parameters and their square-root information.
+        lenses: lenses of `kcal.io.foreign_lenses.LENSES` that it can hold as well.
+        wide: whether these are chosen unasked where kcal's models are far off.
     """
 
     title: str
     models: tuple[str, ...]
     read: Callable[[Path, Hints], ImportedCameras]
     suffixes: tuple[str, ...] = ()
-    write: Callable[[Sequence[Camera], Sequence[Pose], Path], list[Path]] | None = None
+    write: Callable[[Sequence[Any], Sequence[Pose], Path], list[Path]] | None = None
     skew: bool = False
-    pose: bool = True
+    poses: int = 2
     prior: bool = False
+    lenses: tuple[str, ...] = ()
+    wide: bool = False
 
 
+_ANY = 1_000_000
 # The first section of an INI file or of TOML.
 _SECTION = re.compile(r"(?:[ \t]*(?:[#;].*)?\n)*+[ \t]*\[\w[\w .-]*\][ \t]*\n")
 # What begins the cameras of Qualisys, and the sensors or the calibration of Metashape.
@@ -73,7 +79,7 @@ _XML = re.compile(r"<cameras(?=>\s*<camera[^>]*serial)|<sensors(?=[ >])|<calibra
 def _prior_format(program: str, title: str, models: tuple[str, ...]) -> CameraFormat:
     return CameraFormat(
         title=title, models=models, read=format_prior.read_prior,
-        write=format_prior.prior_writer(program), skew=program == "gtsam", pose=False, prior=True,
+        write=format_prior.prior_writer(program), skew=program == "gtsam", poses=0, prior=True,
     )  # fmt: skip
 
 
@@ -96,6 +102,9 @@ FORMATS = {
         models=("pinhole", "opencv4", "fisheye4"),
         read=format_kalibr.read_kalibr,
         write=format_kalibr.write_kalibr,
+        poses=_ANY,
+        lenses=tuple(format_kalibr.KALIBR_LENSES),
+        wide=True,
     ),
     "mrcal": CameraFormat(
         title="mrcal cameramodel, a file per camera",
@@ -103,6 +112,7 @@ FORMATS = {
         models=("pinhole", "opencv4", "opencv5", "opencv8", "opencv12"),
         read=format_mrcal.read_mrcal,
         write=format_mrcal.write_mrcal,
+        poses=_ANY,
     ),
     "colmap": CameraFormat(
         title="COLMAP cameras.txt or cameras.bin",
@@ -110,7 +120,8 @@ FORMATS = {
         models=("pinhole", "opencv4", "opencv8", "fisheye4"),
         read=format_photos.read_colmap,
         write=format_photos.write_colmap,
-        pose=False,
+        lenses=("rad-tan-thin-prism", "eucm", "fov", "division"),
+        poses=0,
     ),
     "nerfstudio": CameraFormat(
         title="nerfstudio transforms.json",
@@ -118,7 +129,7 @@ FORMATS = {
         models=("pinhole", "opencv4", "opencv5", "fisheye4"),
         read=format_photos.read_nerfstudio,
         write=format_photos.write_nerfstudio,
-        pose=False,
+        poses=0,
     ),
     "matlab": CameraFormat(
         title="MATLAB struct of camera or stereo parameters",
@@ -133,7 +144,8 @@ FORMATS = {
         models=("pinhole", "opencv4", "opencv5", "fisheye4"),
         read=format_photos.read_opensfm,
         write=format_photos.write_opensfm,
-        pose=False,
+        lenses=("fisheye624",),
+        poses=0,
     ),
     "toml": CameraFormat(
         title="TOML of aniposelib, pose2sim and Caliscope; INI",
@@ -141,9 +153,10 @@ FORMATS = {
         models=(*OPENCV_MODELS.values(), "fisheye4"),
         read=format_opencv.read_toml,
         write=format_opencv.write_toml,
+        poses=_ANY,
     ),
-    "qualisys": CameraFormat(title="Qualisys .qca.txt", models=(), read=format_photos.read_qualisys, pose=False),
-    "agisoft": CameraFormat(title="Agisoft Metashape XML", models=(), read=format_photos.read_agisoft, pose=False),
+    "qualisys": CameraFormat(title="Qualisys .qca.txt", models=(), read=format_photos.read_qualisys, poses=0),
+    "agisoft": CameraFormat(title="Agisoft Metashape XML", models=(), read=format_photos.read_agisoft, poses=0),
     "gtsam": _prior_format("gtsam", "Values and noise model for GTSAM, JSON", format_prior.GTSAM_MODELS),
     "ceres": _prior_format("ceres", "A and b of Ceres's NormalPrior, JSON", format_prior.PLAIN_MODELS),
     "numpy": _prior_format("numpy", "Parameters and their square-root information, .npz", format_prior.PLAIN_MODELS),

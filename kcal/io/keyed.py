@@ -31,7 +31,7 @@ from kcal.io.foreign import (
     whole_size,
     with_sigmas,
 )
-from kcal.io.format_kalibr import central_camera
+from kcal.io.foreign_lenses import foreign_camera
 from kcal.lens.camera import Camera
 from kcal.lens.camera_conversions import OPENCV_MODELS, ImageTransform
 from kcal.lens.pose import Pose, rotation_from_vector
@@ -284,8 +284,7 @@ def _camera(named: _Named, side: str, name: str, hints: Hints, notes: list[str])
     if named.get("xi", side) is not None:
         if len(lens) != 4 or skew:
             raise ValueError("an omnidir camera has 4 coefficients and, here, no skew")
-        inner = named_camera(name, core, size, "opencv4", lens)
-        camera, note = central_camera("omni", inner, [named.number("xi", side)])
+        camera, note = foreign_camera("omni-radtan", name, core, size, [named.number("xi", side), *lens])
         notes.append(note)
         return camera
     if fisheye and lens and len(lens) != 4:

@@ -172,7 +172,7 @@ BOUGUET |= {"alpha_c": 0.004, "nx": 640.0, "ny": 480.0}
 PRISM = [0.01, 0.002, 1e-4, 2e-4, 0.01, 0.001, 1e-4, 2e-4]
 COLMAP = "1 {} 640 480 {} {}\n"
 FIELDS = " ".join(map(str, C))
-TWELVE = COLMAP.format("RAD_TAN_THIN_PRISM_FISHEYE", FIELDS, "0 " * 12)
+PANORAMA = COLMAP.format("EQUIRECTANGULAR", "", "640 480").replace("  ", " ")
 
 READ: dict[str, tuple[str, Any, Pixels]] = {
     **{
@@ -418,7 +418,7 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
     "fisheye with p1": ("t.json", nerf(is_fisheye=True, p1=0.1), "p1: a fisheye has no such term"),
     "fraction": ("a.json", SIZE | {"K": [[0.8, 0, 0.49], [0, 1.05, 0.5], [0, 0, 1]], "D": D}, "fraction of the image"),
     "no camera in text": ("notes.txt", "camera number four\nlens cap lost\n", "not a camera file that kcal knows"),
-    "COLMAP's twelve": ("cameras.txt", TWELVE, "camera model RAD_TAN"),
+    "COLMAP's panorama": ("cameras.txt", PANORAMA, "camera model EQUIRECTANGULAR"),
     "cut gzip": ("a.yml.gz", gzip.compress(opencv("K", "D").encode())[:-20], "cut short"),
     "no size": ("a.json", {"K": M, "D": D}, "image size is not in the file"),
 }
@@ -484,13 +484,13 @@ def run(*arguments: str | Path) -> tuple[int, str]:
 
 
 def test_one_camera_that_cannot_be_read_does_not_refuse_the_others(tmp_path: Path) -> None:
-    text = COLMAP.format("PINHOLE", FIELDS, "") + TWELVE.replace("1 R", "2 R")
+    text = COLMAP.format("PINHOLE", FIELDS, "") + PANORAMA.replace("1 E", "2 E")
     path, out = written(tmp_path, "cameras.txt", text), tmp_path / "out.json"
     found = import_cameras(path)
     assert (found.names, list(found.unread)) == (("1",), ["2"])
     for camera, wanted in (
         ("1", (0, "camera 2 cannot be read")),
-        ("2", (1, "RAD_TAN")),
+        ("2", (1, "EQUIRECT")),
         (None, (1, "2 cameras; name")),
     ):
         code, words = run("import", f"{path}:{camera}" if camera else path, "-o", out)

@@ -63,7 +63,7 @@ def test_one_camera(name: str, suffix: str, model: str, tmp_path: Path) -> None:
     same(found.cameras[0], wanted)
 
 
-@pytest.mark.parametrize("name", [name for name, known in FORMATS.items() if known.pose and known.write])
+@pytest.mark.parametrize("name", [name for name, known in FORMATS.items() if known.poses and known.write])
 def test_a_pair(name: str, tmp_path: Path) -> None:
     """Turned about all axes, the right camera not beside the left one alone."""
     model = "opencv5" if "opencv5" in FORMATS[name].models else "opencv4"

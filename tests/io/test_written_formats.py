@@ -12,7 +12,8 @@ from scipy.io import loadmat
 
 from kcal import Camera, Rig
 from kcal.io.foreign import rig_poses
-from kcal.io.format_kalibr import fit_omni, project_omni, write_omni
+from kcal.io.foreign_lenses import ForeignCamera
+from kcal.io.format_kalibr import write_kalibr
 from kcal.io.format_mrcal import fit_spline, project_spline
 from kcal.io.format_opencv import write_matlab
 from kcal.lens import import_cameras
@@ -58,25 +59,14 @@ def test_matlab_has_one_camera_or_a_pair(tmp_path: Path) -> None:
 def test_an_omni_lens_is_written_as_kalibr_has_it(tmp_path: Path) -> None:
     rig = pair()
     values = [
-        [1.1, 600.0, 601.0, 320.0, 240.0, -0.1, 0.01, 0.001, 0.002],
-        [0.9, 590.0, 591.0, 321.0, 241.0, 0, 0, 0, 0],
+        (600.0, 601.0, 320.0, 240.0, 0.0, 1.1, -0.1, 0.01, 0.001, 0.002),
+        (590.0, 591.0, 321.0, 241.0, 0.0, 0.9, 0.0, 0.0, 0.0, 0.0),
     ]
-    (path,) = write_omni([rig.left, rig.right], values, rig_poses(rig), tmp_path / "chain.yaml")
+    lenses = [ForeignCamera("omni-radtan", own, (640, 480), "") for own in values]
+    (path,) = write_kalibr(lenses, rig_poses(rig), tmp_path / "chain.yaml")
     first, second = (yaml.safe_load(path.read_text())[name] for name in ("cam0", "cam1"))
     assert (first["camera_model"], first["distortion_model"]) == ("omni", "radtan")
-    assert first["intrinsics"] + first["distortion_coeffs"] == values[0]
+    assert first["intrinsics"] == [1.1, 600.0, 601.0, 320.0, 240.0]
+    assert first["distortion_coeffs"] == [-0.1, 0.01, 0.001, 0.002]
     assert "T_cn_cnm1" not in first
     assert np.array(second["T_cn_cnm1"])[:3, 3].tolist() == pytest.approx([-0.1, 0, 0])
-
-
-def test_an_omni_lens_is_found_again() -> None:
-    truth = np.array([1.2, 600.0, 601.0, 320.0, 240.0, -0.1, 0.01, 0.001, 0.002])
-    angle, turn = np.meshgrid(np.linspace(0.01, 1.4, 15), np.linspace(0.0, 6.0, 20))
-    rays = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], -1).reshape(-1, 3)
-    pixels, ahead = project_omni(truth, rays)
-    assert ahead.all()
-    # On the axis, xi only scales the focal length; lengths of rays do not matter.
-    assert project_omni(truth, np.array([[0.0, 0.0, 3.0]]))[0][0].tolist() == [320.0, 240.0]
-    assert not project_omni(np.array([0.5, *truth[1:]]), np.array([[0.0, 0.1, -2.0]]))[1].any()
-    found = fit_omni(rays, pixels, 270.0)
-    assert np.abs(project_omni(found, 2.0 * rays)[0] - pixels).max() < 1e-3

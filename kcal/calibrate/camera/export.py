@@ -18,8 +18,7 @@ from kcal.calibrate.problem.parameters import CoefficientPrior
 from kcal.errors import DegenerateError, InputError
 from kcal.files import write_atomic
 from kcal.io.foreign import camera_name, paths_for, plain, rig_poses
-from kcal.io.format_kalibr import NAME as OMNI
-from kcal.io.format_kalibr import fit_omni, project_omni, write_omni
+from kcal.io.foreign_lenses import ForeignCamera, fit_foreign
 from kcal.io.format_mrcal import fit_spline, project_spline, write_model, write_mrcal
 from kcal.io.format_prior import prior_of, write_priors
 from kcal.io.formats import FORMATS, CameraFormat, format_named, held_exactly
@@ -147,7 +146,7 @@ def refit_camera(
 
 _SPLINE_SAMPLES = (193, 145)
 REMAP = "remap"
-# Pixels (RMS) up to which a pinhole model of Kalibr stands for a lens.
+# Pixels (RMS) up to which kcal's models stand for a lens in formats that have wide ones.
 _NEAR = 0.2
 
 
@@ -211,7 +210,8 @@ def export_cameras(
     opensfm, gtsam, ceres, numpy. Formats with one camera per file get NAME_left and NAME_right for a rig.
 
     Cameras of one file get one lens model, the one that is nearest to all of them, with a note on those that would be
-    nearer without the others. Kalibr's chains hold wide lenses as omni-radtan, where its pinhole models are far off.
+    nearer without the others. Kalibr's chains and Basalt's files hold lenses that are far off their pinhole and fisheye
+    models as the nearest of omni-radtan, ds, eucm and fov.
 
     What is known of the cameras is written beside the file, as NAME.prior.json, or in it (gtsam, ceres, numpy): the
     parameters in the program's order and their square-root information, the misfit of a lens that was fitted included.
@@ -220,8 +220,8 @@ def export_cameras(
         cameras: a single camera, a rig, or single cameras without poses.
         path: of the file.
         format: name of the format; None: by the suffix.
-        model: lens model of kcal to fit, one that the format holds; None: the one that contains the lens, else the one
-            that comes nearest.
+        model: lens model to fit, of kcal or of the program, one that the format holds; None: the one that contains the
+            lens, else the one that comes nearest.
 
     Raises:
         InputError: batches, an unknown format, a model that the format does not hold, or a lens that no model of the
@@ -249,24 +249,31 @@ def export_cameras(
     if name == REMAP:
         return _write_maps(several, path)
     known = FORMATS[name]
-    if not known.pose or len(several) > 2:
+    if len(several) > known.poses:
         poses = ()
-    if model is not None and str(LensModel.named(model)) not in known.models:
-        raise InputError(f"{name} files do not hold {model}; choose one of {', '.join(known.models)}")
-    exact = [held_exactly(camera, [model] if model else known.models, known.skew) for camera in several]
+    model = model and str(model)
+    if model is not None and model not in (*known.lenses, *known.models):
+        raise InputError(f"{name} files do not hold {model}; choose one of {', '.join((*known.models, *known.lenses))}")
+    kinds = known.models if model is None else [model] if model in known.models else []
+    exact = [held_exactly(camera, kinds, known.skew) for camera in several]
     if name == "mrcal" and model is None and None in exact:
         return _write_splines(several, exact, poses, path, _lost(several, rig, known))
-    found, notes = _in_one_model(several, exact, name, model)
-    if name == "kalibr" and model is None and (omni := _nearer_omni(several, found)) is not None:
-        values, omni_misfits = omni
-        return ExportedCameras(
-            format=name,
-            paths=tuple(write_omni(several, values, poses, path)),
-            models=(OMNI,) * len(several),
-            misfits=omni_misfits,
-            lost=_lost(several, rig, known),
-            notes=(_omni_instead(several, found, omni_misfits),),
-        )
+    found, notes = _in_one_model(several, exact, name, model) if kinds else ([], ())
+    far = model is None and known.wide and _squares(found) > len(several) * _NEAR**2
+    if far or not kinds:
+        other = _nearest_foreign(several, [model] if model else known.lenses)
+        if other is None and model:
+            raise InputError(f"the lens {model} does not show the whole image of this camera; choose another model")
+        if other is not None and (model or _all_squares(other[1]) < 0.25 * _squares(found)):
+            assert known.write is not None
+            return ExportedCameras(
+                format=name,
+                paths=tuple(known.write(other[0], poses, path)),
+                models=tuple(lens.kind for lens in other[0]),
+                misfits=other[1],
+                lost=_lost(several, rig, known),
+                notes=() if model else (_foreign_instead(other[0], found, other[1]),),
+            )
     written = [_with_covariance(camera, *one) for camera, one in zip(several, found, strict=True)]
     priors = [
         prior_of(name, camera, None if one.misfit is None else (one.misfit.rms, one.misfit.largest))
@@ -373,39 +380,38 @@ def _squares(found: Sequence[_Fitted]) -> float:
     return sum(_misfit_rms(one) ** 2 for one in found)
 
 
-def _omni_instead(cameras: Sequence[Camera], found: Sequence[_Fitted], misfits: Sequence[Misfit]) -> str:
-    """A note that Kalibr's own wide lens stands for all cameras."""
+def _nearest_foreign(
+    cameras: Sequence[Camera], kinds: Sequence[str]
+) -> tuple[list[ForeignCamera], tuple[Misfit, ...]] | None:
+    """The cameras in the lens of other programs that comes nearest to all; None if none shows all of an image."""
+    best = None
+    for kind in kinds:
+        lenses = [fit_foreign(kind, camera) for camera in cameras]
+        try:
+            misfits = tuple(
+                measured_misfit(camera, kind, lens.project) for camera, lens in zip(cameras, lenses, strict=True)
+            )
+        except DegenerateError:
+            continue
+        folds = [not bool(lens.unproject(camera.grid(33, 25).reshape(-1, 2))[1].all())
+                 for camera, lens in zip(cameras, lenses, strict=True)]  # fmt: skip
+        if not any(folds) and (best is None or _all_squares(misfits) < _all_squares(best[1])):
+            best = lenses, misfits
+    return best
+
+
+def _all_squares(misfits: Sequence[Misfit]) -> float:
+    return sum(misfit.rms**2 for misfit in misfits)
+
+
+def _foreign_instead(lenses: Sequence[ForeignCamera], found: Sequence[_Fitted], misfits: Sequence[Misfit]) -> str:
+    """A note that another lens of the program stands for all cameras."""
     names = ", ".join(
-        f"{camera_name(camera, f'camera {number}')} RMS {misfit.rms:.2g} px"
-        for number, (camera, misfit) in enumerate(zip(cameras, misfits, strict=True), 1)
+        f"{lens.name or f'camera {number}'} RMS {misfit.rms:.2g} px"
+        for number, (lens, misfit) in enumerate(zip(lenses, misfits, strict=True), 1)
     )
     most = max(map(_misfit_rms, found))
-    return f"written as {OMNI} ({names}): in one pinhole model of Kalibr the RMS is up to {most:.2g} px"
-
-
-def _nearer_omni(
-    cameras: Sequence[Camera], found: Sequence[_Fitted]
-) -> tuple[list[list[float]], tuple[Misfit, ...]] | None:
-    """Kalibr's omni-radtan of each camera, where its pinhole models are far off and this one is much nearer."""
-    if _squares(found) <= len(cameras) * _NEAR**2:
-        return None
-    values, misfits = [], []
-    for camera in cameras:
-        pixels = camera.grid(33, 25).reshape(-1, 2)
-        rays, valid = camera.unproject(pixels)
-        own = fit_omni(rays[valid].numpy(), pixels[valid].numpy(), float(camera.focal.mean()))
-
-        def project(rays: Tensor, own=own) -> tuple[Tensor, Tensor]:  # type: ignore[no-untyped-def]
-            seen, ahead = project_omni(own, rays.numpy())
-            return torch.from_numpy(seen), torch.from_numpy(ahead)
-
-        try:
-            misfits.append(measured_misfit(camera, OMNI, project))
-        except DegenerateError:
-            return None
-        values.append(own.tolist())
-    nearer = sum(misfit.rms**2 for misfit in misfits) < 0.25 * _squares(found)
-    return (values, tuple(misfits)) if nearer else None
+    return f"written as {lenses[0].kind} ({names}): in one model of kcal's that the format holds, up to {most:.2g} px"
 
 
 def _lost(cameras: Sequence[Camera], rig: Rig | None, known: CameraFormat, carried: bool = False) -> tuple[str, ...]:
@@ -416,7 +422,7 @@ def _lost(cameras: Sequence[Camera], rig: Rig | None, known: CameraFormat, carri
         and any(record.covariance is not None or record.sigma is not None for record in records),
         "calibration record": any(record.record is not None for record in records),
         "entrance pupil": any(bool((camera.coefficients[1:3] != 0).any()) for camera in cameras if camera.model.hybrid),
-        "relative pose": rig is not None and not known.pose,
+        "relative pose": rig is not None and len(cameras) > known.poses,
         "covariance of the rig": rig is not None and (rig.covariance is not None or rig.root is not None),
         "mounting": rig is not None and (rig.mounting is not None or rig.origin is not None),
     }

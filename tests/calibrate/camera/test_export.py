@@ -48,7 +48,7 @@ def test_what_a_format_holds_comes_back(tmp_path: Path, name: str, model: str) -
     assert float((back.project_rays(rays)[0] - pixels).abs().max()) < 1e-9
 
 
-@pytest.mark.parametrize("name", [name for name in FORMATS if FORMATS[name].pose])
+@pytest.mark.parametrize("name", [name for name in FORMATS if FORMATS[name].poses])
 def test_a_rig_comes_back(tmp_path: Path, name: str) -> None:
     rig = Rig.pair(camera("opencv4"), camera("pinhole"), ROTATION, TRANSLATION)
     back = import_cameras(*export_cameras(rig, tmp_path / FILES[name], format=name).paths).rig()
