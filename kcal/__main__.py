@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import os
 import signal
 import sys
@@ -23,6 +24,10 @@ def main() -> None:
     # The garbage collector would search the imported libraries again and again while they load and once more at the
     # end: .55 of 2.1 CPU s of `kcal diff`. Cyclic garbage of ordinary work stays below 50,000 objects.
     gc.set_threshold(50_000, 20, 20)
+    # A pipe on Windows has no σ, nor has the locale C: files and other programs get UTF-8, a screen what it can show.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(encoding=None if stream.isatty() else "utf-8", errors="replace")
     listen()
     # What loads now takes .3 s; the line that shows the progress then takes this place.
     if (

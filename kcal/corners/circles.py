@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -16,6 +15,7 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.corners.images import Gray
 from kcal.corners.saddle import CornerStatus, Refined, with_status
+from kcal.opencv import cv2
 
 # Fit the edge of a blurred dark or light ellipse: its center with covariance, its shape, its blur.
 #

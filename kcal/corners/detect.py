@@ -14,7 +14,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -41,6 +40,7 @@ from kcal.corners.search import SEARCH_SIDES, find_board, reduced, refine_throug
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes, source_name
+from kcal.opencv import cv2
 from kcal.texts import brief
 
 # What the search for a board in one image gives.

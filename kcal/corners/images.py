@@ -20,7 +20,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import ExifTags, Image, UnidentifiedImageError
@@ -29,6 +28,7 @@ from PIL.JpegImagePlugin import JpegImageFile
 from kcal.errors import FileError, InputError
 from kcal.file_kind import check_image_header, check_pixel_count, is_heif
 from kcal.files import is_stream, read_bytes, read_head
+from kcal.opencv import cv2
 
 Gray = npt.NDArray[np.uint8 | np.uint16]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -18,6 +17,7 @@ from kcal.corners.markers import opencv_dictionary
 from kcal.corners.saddle import CornerStatus, inside_image, saddle
 from kcal.corners.search import filled_grid
 from kcal.errors import InputError
+from kcal.opencv import cv2
 
 # Whether markers lie in an image as they lie on a board.
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from kcal.corners.board import DICTIONARIES, Board
 from kcal.errors import InputError
+from kcal.opencv import cv2
 
 
 def marker_cells(board: Board) -> list[npt.NDArray[np.bool_]]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -33,6 +32,7 @@ from kcal.corners.patches import (
 )
 from kcal.errors import InputError
 from kcal.lens.rig import Rig
+from kcal.opencv import cv2
 from kcal.texts import brief
 
 # Find a point of the left image in the right one: correlation along the epipolar line, then least squares.
@@ -350,7 +350,7 @@ def keypoints(image: Gray, most: int) -> Keypoints:
         most: number at most.
     """
     found, descriptors = cv2.SIFT_create(contrastThreshold=_CONTRAST).detectAndCompute(to_8bit(image), None)  # type: ignore[attr-defined]
-    if descriptors is None:
+    if not found:
         return Keypoints(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 128))
     pixels = np.array([point.pt for point in found], np.float64)
     order = np.argsort([-point.response for point in found], kind="stable")

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import escape
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -18,6 +17,7 @@ from kcal.corners.board import TAGS, Board
 from kcal.corners.markers import marker_cells, opencv_dictionary
 from kcal.errors import InputError
 from kcal.files import write_atomic
+from kcal.opencv import cv2
 
 # Write black shapes and short texts as SVG or PDF at true scale.
 #

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -19,6 +18,7 @@ from kcal.corners.marker_boards import BORDERS, nearer
 from kcal.corners.markers import opencv_dictionary
 from kcal.corners.search import MIN_FILLED, SEARCH_SIDES, board_ends, grown_grid, reduced, seeds
 from kcal.errors import InputError
+from kcal.opencv import cv2
 
 # Markers: which dictionary, and how they lie.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Literal, get_args
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -16,6 +15,7 @@ from kcal.corners.erf import erf_saddle
 from kcal.corners.grid import line_bend, local_side, neighbors
 from kcal.corners.images import Gray
 from kcal.errors import InputError
+from kcal.opencv import cv2
 
 Refinement = Literal["erf", "saddle", "opencv", "skimage", "none"]
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -33,6 +32,7 @@ from kcal.corners.grid import (
 from kcal.corners.images import Gray
 from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import CornerStatus, saddle
+from kcal.opencv import cv2
 
 # Put detected corners into the board's order, however the board was held.
 

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from torch import Tensor
@@ -22,6 +21,7 @@ from kcal.corners.refine import Refinement
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
 from kcal.files import is_stream, source_name, write_atomic
+from kcal.opencv import cv2
 
 MOST_VIEWS = 40
 DURATION = 120.0  # seconds: how long a live stream is read by default

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from kcal.errors import InputError
@@ -37,6 +36,7 @@ from kcal.io.foreign import (
 from kcal.io.keyed import flat, read_keyed
 from kcal.lens.camera import Camera
 from kcal.lens.pose import Pose, vector_from_rotation
+from kcal.opencv import cv2
 from kcal.strict_formats import read_mat, read_npz, read_storage
 from kcal.strict_json import read_json
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kcal.errors import InputError
 from kcal.files import open_atomic, write_atomic
+from kcal.opencv import cv2
 
 # Images in color or gray as PNG files; `kcal.corners.images` reads images.
 

@@ -8,14 +8,18 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 from cyclonedx.schema import SchemaVersion
 from cyclonedx.validation.json import JsonStrictValidator
 from packaging.utils import canonicalize_name
 
+from scripts.make_recipe import RECIPE
+from scripts.make_recipe import text as recipe_text
 from scripts.make_sbom import SBOM, content, requirements
 
 ROOT = Path(__file__).parents[2]
@@ -64,3 +68,17 @@ def test_the_bill_of_materials_is_true() -> None:
     assert all(each["licenses"] and "not stated" not in str(each["licenses"]) for each in stored["components"])
     # And the packages that these need, by the metadata of what is installed here.
     assert {each["name"] for each in content()["components"]} == found.keys()
+
+
+def test_the_recipe_is_that_of_pyproject() -> None:
+    assert RECIPE.read_text(encoding="utf-8") == recipe_text()
+
+
+def test_the_release_workflow_builds_as_here_and_publishes_after_the_tests() -> None:
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text(encoding="utf-8"))["jobs"]
+    assert "make wheel" in [step.get("run") for step in jobs["build"]["steps"]]
+    assert "\nwheel:" in (ROOT / "Makefile").read_text(encoding="utf-8")
+    lowest = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["requires-python"]
+    assert lowest == f">={min(jobs['test']['strategy']['matrix']['python'])}"
+    assert (jobs["publish"]["needs"], jobs["test"]["needs"]) == ("test", "build")
+    assert jobs["publish"]["if"] == "github.ref_type == 'tag'"
