@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.utils import _pytree
 
 from kcal.errors import InputError
+from kcal.texts import brief
 
 # Check what users pass: clear errors instead of silent broadcasting or rounding.
 
@@ -192,6 +193,8 @@ def as_covariance(name: str, matrix: Tensor | ArrayLike | None, size: int) -> Te
 
 class Float64Module(nn.Module):
     """A module whose float64 tensors keep their precision under `.half()`, `.float()` and `.to(dtype)`."""
+
+    __repr__ = brief
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         return super()._apply(keep_float64(fn), recurse)

@@ -142,3 +142,12 @@ def _is_kind(value: Any, hint: Any) -> bool:
         each = inside[:1] * len(value) if kind is not tuple or ... in inside else inside
         return len(each) in (0, len(value)) and all(map(_is_kind, value, each))
     return isinstance(value, kind)
+
+
+def shown_in_notebooks(record: Any) -> str | None:
+    """The picture and the table that the command line gives, as HTML: what `_repr_html_` is in a class.
+
+    `kcal.report` makes them, above the rooms whose results they show. It is loaded by its name, like a door's modules.
+    """
+    html: str | None = importlib.import_module("kcal.report.notebook").html_of(record)
+    return html

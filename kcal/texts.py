@@ -12,7 +12,7 @@ import math
 import re
 import textwrap
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 # The one way by which a text reaches a page, a table, an XML file or a terminal, where some characters would act.
 #
@@ -28,6 +28,7 @@ _ACTING = re.compile(
     + "".join(f"{chr(plane + 0xFFFE)}{chr(plane + 0xFFFF)}" for plane in range(0, 0x110000, 0x10000))
     + "]"
 )
+_T = TypeVar("_T")
 _NUMBER = re.compile(r"[+-]?[0-9]+(\.[0-9]+)?")
 # Spreadsheets read a cell that begins with one of these as a formula; in Japanese settings, the wide ones too.
 _FORMULA = tuple("=+-@＝＋－＠")
@@ -143,8 +144,8 @@ def brief(record: Any, **said: str) -> str:
     """The `repr` of a record in three lines at most: numbers and words first, then shapes of tensors and counts.
 
     Args:
-        record: a dataclass, a named tuple or a pydantic model. Fields that are None, empty or as by default are left
-            out.
+        record: a dataclass, a named tuple, a pydantic model or a module of torch. Fields that are None, empty or as by
+            default are left out.
         said: words in place of fields.
 
     Example:
@@ -154,6 +155,9 @@ def brief(record: Any, **said: str) -> str:
         "Detection(reason='blurred', pixels=(54, 2))"
     """
     kind = type(record)
+    if hasattr(record, "named_children"):
+        children = (f"{name}={_brief_module(child)}" for name, child in record.named_children())
+        return _in_lines(kind, [one for one in (record.extra_repr(), *children) if one])
     if dataclasses.is_dataclass(record):
         defaults = {field.name: field.default for field in dataclasses.fields(record) if field.repr}
     else:
@@ -165,10 +169,31 @@ def brief(record: Any, **said: str) -> str:
         value = getattr(record, name)
         is_plain = isinstance(value, str | int | float)
         text = said.get(name) or f"{name}={_brief_value(value)}"
-        if not (value is None or name.startswith("_") or text.endswith("=") or (is_plain and value == default)):
+        usual = value is None or value is default or (is_plain and value == default)
+        if not (usual or name.startswith("_") or text.endswith("=")):
             (plain if is_plain or name in said else rest).append(text)
-    text = f"{kind.__name__}({', '.join([*plain, *rest])})"
-    return "\n".join(textwrap.wrap(text, 116, subsequent_indent="  ", max_lines=3, placeholder=" ...)"))
+    return _in_lines(kind, [*plain, *rest])
+
+
+def briefly(kind: type[_T]) -> type[_T]:
+    """Give a class, of which mypy takes no `__repr__ = brief`, that `repr`: a named tuple."""
+    kind.__repr__ = brief  # type: ignore[method-assign]
+    return kind
+
+
+def _in_lines(kind: type, parts: list[str]) -> str:
+    text = f"{kind.__name__}({', '.join(parts)})"
+    return "\n".join(textwrap.wrap(text, 99, subsequent_indent="  ", max_lines=3, placeholder=" ...)"))
+
+
+def _brief_module(module: Any) -> str:
+    """One of kcal by its own words, several that are alike once, another by its class."""
+    if type(module).__repr__ is brief:
+        return " ".join(repr(module).split())
+    inside = [_brief_module(child) for child in module._modules.values()]
+    kinds = {type(child).__name__ for child in module._modules.values()}
+    alike = set(inside) if len(set(inside)) == 1 else kinds
+    return f"{len(inside)} x {alike.pop()}" if len(alike) == 1 else type(module).__name__
 
 
 def _brief_value(value: Any) -> str:

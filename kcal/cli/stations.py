@@ -246,38 +246,9 @@ def _calibrated_from(rig: kcal.Rig, pairs: Sequence[Path]) -> bool:
 
 def print_stands(rig: kcal.Rig) -> None:
     """Print how each camera stands, with error bars: on the Earth, or in the rig's own frame."""
-    import torch
+    from kcal.report.shown import stands
 
-    from kcal.locate.stations import station_stands
-
-    axes, heads, digits = ("east_m", "north_m", "up_m"), ["east m", "north m", "up m"], (3, 3, 3)
-    if rig.origin:
-        axes, heads, digits = ("lat", "lon", "height"), ["lat", "lon", "height m"], (7, 7, 2)
-    # The frame of the first camera has no north.
-    own = not rig.origin and torch.equal(rig.rotation[0], torch.eye(3).to(rig.rotation))
-    heads = ["x m", "y m", "z m"] if own else [*heads, "± level", "± up", "heading °", "pitch °", "roll °"]
-    rows, told = [["camera", "RMS px", *heads]], {}
-    residuals = rig.calibration.rms_px if rig.calibration else (None,) * len(rig)
-    for c, (name, residual) in enumerate(zip(rig.names, residuals, strict=True)):
-        place, angles, covariance = station_stands(rig, c)
-        told[name] = dict(zip((*axes, "heading_deg", "pitch_deg", "roll_deg"), (*place, *angles), strict=True))
-        where = [f"{value:.{many}f}" for value, many in zip(place, digits, strict=True)]
-        how = ["", "", *(f"{angle:.4f}" for angle in angles)]
-        if rig.root is not None and covariance is not None:
-            sigma = covariance.diagonal().sqrt().tolist()
-            told[name] |= {"sigma_m": max(sigma[:3]), "sigma_deg": math.degrees(max(sigma[3:6]))}
-            level = math.degrees(max(sigma[3:5]))
-            if not own:
-                where[2] = number_text(place[2], sigma[2])
-            if not own and not rig.origin:
-                where[:2] = map(number_text, place[:2], sigma[:2])
-            how = [
-                length_text(max(sigma[:2]), digits=2), length_text(sigma[2], digits=2),
-                measured_text(angles[0], math.degrees(sigma[5])), measured_text(angles[1], level),
-                number_text(angles[2], level),
-            ]  # fmt: skip
-        rms = "" if residual is None else f"{residual:.3f}"
-        rows.append([name, rms, *where, *([] if own else how)])
+    rows, told = stands(rig)
     print_table(rows)
     tell(cameras=told)
 

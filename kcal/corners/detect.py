@@ -41,7 +41,7 @@ from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes, source_name
 from kcal.opencv import cv2
-from kcal.texts import brief
+from kcal.texts import briefly
 
 # What the search for a board in one image gives.
 
@@ -65,6 +65,7 @@ _CURES = {
 }
 
 
+@briefly
 class Detection(NamedTuple):
     """What was found of a board in an image.
 
@@ -82,9 +83,6 @@ class Detection(NamedTuple):
     covariance: Tensor | None = None
     legacy: bool | None = None
     rejected: Tensor | None = None
-
-    def __repr__(self) -> str:
-        return brief(self)
 
 
 def too_few(refined: Refined, found: int) -> str:

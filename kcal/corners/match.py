@@ -33,7 +33,7 @@ from kcal.corners.patches import (
 from kcal.errors import InputError
 from kcal.lens.rig import Rig
 from kcal.opencv import cv2
-from kcal.texts import brief
+from kcal.texts import brief, briefly
 
 # Find a point of the left image in the right one: correlation along the epipolar line, then least squares.
 #
@@ -62,6 +62,7 @@ class MatchStatus(IntEnum):
     SATURATED = 9  # too much of the object is at the brightest gray level
 
 
+@briefly
 class Matches(NamedTuple):
     """Points matched in the right image.
 
@@ -78,9 +79,6 @@ class Matches(NamedTuple):
     status: Tensor
     score: Tensor
     off_line: Tensor
-
-    def __repr__(self) -> str:
-        return brief(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -438,6 +436,8 @@ class RefinedPoint:
         covariance: (2, 2) px², from how closely the edges meet in one point. An upper bound: blur rounds a corner,
             so that no edge points exactly at it.
     """
+
+    __repr__ = brief
 
     pixel: Tensor
     covariance: Tensor

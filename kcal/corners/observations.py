@@ -10,6 +10,7 @@ import pydantic
 
 from kcal.arrow import ArrowRows, arrow_table
 from kcal.corners.board import Board
+from kcal.doors import shown_in_notebooks
 from kcal.errors import InputError
 from kcal.file_kind import ImageSize
 from kcal.native_file import NativeFile, Record
@@ -80,6 +81,8 @@ class Observations(ArrowRows, NativeFile):
         >>> tuple(seen.pixels().shape), bool(seen.pixels()[0, 3].isnan().all())
         ((1, 4, 2), True)
     """
+
+    _repr_html_ = shown_in_notebooks
 
     KIND: ClassVar[str] = "observations"
     VERSION: ClassVar[int] = 1

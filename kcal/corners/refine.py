@@ -16,6 +16,7 @@ from kcal.corners.grid import line_bend, local_side, neighbors
 from kcal.corners.images import Gray
 from kcal.errors import InputError
 from kcal.opencv import cv2
+from kcal.texts import brief
 
 Refinement = Literal["erf", "saddle", "opencv", "skimage", "none"]
 
@@ -127,6 +128,8 @@ class RefineCorners(nn.Module):
         >>> [round(value, 6) for value in found.pixels[0, 0].tolist()], found.pixels.requires_grad
         ([20.6, 19.3], True)
     """
+
+    __repr__ = brief
 
     def __init__(self, method: Literal["erf", "saddle"] = "erf", grid: tuple[int, int] | None = None) -> None:
         super().__init__()

@@ -100,8 +100,7 @@ class ImportedCameras:
         turns, shifts = (torch.stack([pose[i] for pose in self.poses]) for i in (0, 1))
         return Rig(self.cameras, self.names, turns, shifts)
 
-    def __repr__(self) -> str:
-        return brief(self)
+    __repr__ = brief
 
 
 def rig_poses(rig: Rig) -> tuple[Pose, ...]:

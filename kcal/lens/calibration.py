@@ -161,6 +161,8 @@ class LensSetting:
         zoom=12.5 focus=3.2
     """
 
+    __repr__ = brief
+
     values: dict[str, float]
     interpolated_from: tuple[str, ...] = ()
 
@@ -267,6 +269,8 @@ class ItemResidual:
         used: whether it is part of the solution.
         reason: why it was left out.
     """
+
+    __repr__ = brief
 
     source: str
     name: str

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.dispatch import finite_or, in_chunks, is_differentiated, known_true, split_coordinates
+from kcal.doors import shown_in_notebooks
 from kcal.errors import InputError
 from kcal.lens.camera_conversions import ConvertibleCamera
 from kcal.lens.camera_parameters import CameraDistortion, ExtendedDistortion
@@ -68,6 +69,8 @@ class Camera(ConvertibleCamera):
         >>> bool(torch.allclose(rays[0] / rays[0, 2] * 10, torch.tensor([1.0, 0, 10], dtype=torch.float64)))
         True
     """
+
+    _repr_html_ = shown_in_notebooks
 
     results = {  # noqa: RUF012
         "project": (((2,), torch.float64), ((), torch.bool)),

@@ -18,6 +18,7 @@ from kcal.lens.camera import Camera, pixels_to_plane
 from kcal.lens.inverse import PreparedInverse
 from kcal.lens.projection import FAR, Projection, project_components, rays_from_plane
 from kcal.lens.region import Region
+from kcal.texts import brief
 
 # `CameraLike`: what a rig, a localizer and `Undistort` ask of a camera; `AdaptedCamera` answers the rest for it.
 
@@ -298,6 +299,8 @@ class Unproject(nn.Module):
         >>> rays.tolist(), valid.tolist()
         ([[0.0, 0.0, 1.0]], [True])
     """
+
+    __repr__ = brief
 
     def __init__(self, camera: Camera, start: LearnedStart | None = None) -> None:
         super().__init__()

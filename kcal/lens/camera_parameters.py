@@ -19,6 +19,7 @@ from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names
 from kcal.lens.region import Region, in_region
 from kcal.operation import Operations
+from kcal.texts import briefly
 
 # Parameters by name, of which some receive gradients: what a camera and a distortion of its own have in common.
 
@@ -215,6 +216,7 @@ class CameraParameters(LensParameters):
 _SHARED = frozenset(LensParameters.__annotations__)
 
 
+@briefly
 class DistortionJacobian(NamedTuple):
     """Derivatives of distorted points (..., N, 2); zero where a point is not valid.
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.func import jvp
 
 from kcal.errors import InputError
+from kcal.texts import briefly
 
 # What the field of a hybrid lens is made of: features with weights, whose prior widths the evidence of the views sets.
 #
@@ -24,6 +25,7 @@ from kcal.errors import InputError
 # weights; only the inside of a network may be trained.
 
 
+@briefly
 class WeightPrior(NamedTuple):
     """The prior width of a weight, in radii of the disc: exp(h[amplitude] - exp(h[decay]) degree).
 

@@ -24,6 +24,7 @@ from kcal.lens.views import (
     pinhole_view,
     source_pixels,
 )
+from kcal.texts import brief, briefly
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,6 +47,7 @@ _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _INTEGERS = (torch.uint8, torch.uint16)
 
 
+@briefly
 class UndistortMaps(NamedTuple):
     """Source positions for `cv2.remap` (float32), and a mask of the pixels that have one; each (H, W)."""
 
@@ -252,6 +254,8 @@ class UndistortImage(nn.Module):
         >>> ImageSequential(UndistortImage(camera), RandomHorizontalFlip())(torch.rand(2, 3, 480, 640)).shape
         torch.Size([2, 3, 480, 640])
     """
+
+    __repr__ = brief
 
     def __init__(
         self, camera: Camera | CameraLike, new_camera: Camera | Cylinder | None = None, rotation: Tensor | None = None

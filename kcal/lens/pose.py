@@ -14,8 +14,10 @@ from torch import Tensor, nn
 from kcal.checks import Float64Module, as_tensor, require_finite
 from kcal.dispatch import is_differentiated
 from kcal.errors import InputError
+from kcal.texts import briefly
 
 
+@briefly
 class Pose(NamedTuple):
     """Rigid motions dst_from_src: `points_dst = rotation @ points_src + translation`.
 

@@ -15,6 +15,7 @@ from kcal.lens.distortion import Distorted, check_coefficients, distort_componen
 from kcal.lens.model import LensModel
 from kcal.lens.projection import largest_radius
 from kcal.lens.zernike import unbind_last
+from kcal.texts import briefly
 
 # Find the region where a lens model is valid: the part around the optical axis before it folds or meets a pole.
 #
@@ -49,6 +50,7 @@ _INSIDE = 0.999
 _BESIDE = 2
 
 
+@briefly
 class Region(NamedTuple):
     """The valid region of a lens on the plane z = 1 (for a fisheye, on the plane of angles).
 

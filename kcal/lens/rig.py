@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from kcal.checks import StatedModule, as_covariance, as_points, as_tensor, require_root, scalar
 from kcal.dispatch import is_differentiated
+from kcal.doors import shown_in_notebooks
 from kcal.errors import InputError, warn_user
 from kcal.lens.calibration import RigCalibration, UntilChanged
 from kcal.lens.camera import Camera
@@ -184,6 +185,8 @@ class Rig(Movable, StatedModule):
         >>> float(Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])).baseline)
         10.0
     """
+
+    _repr_html_ = shown_in_notebooks
 
     refraction: Tensor
     place: Tensor | None

@@ -21,6 +21,7 @@ from kcal.locate.max_likelihood import calibration_effect
 from kcal.locate.mounting import by_mounting
 from kcal.locate.stereo import BEARING_SIGMAS, Localization, PositionStatus, checked_rig, sight_lines
 from kcal.locate.views import fit_pairs
+from kcal.texts import briefly
 from kcal.threads import in_one_thread
 
 # What a stereo rig will do before it is built: range errors against distance, exactly and not to first order.
@@ -54,6 +55,7 @@ class BudgetErrors:
                 raise InputError(f"{field.name}: a number that is not negative is needed")
 
 
+@briefly
 class RangeError(NamedTuple):
     """Change of the range in meters, (D,) for D distances: nearer is negative; infinite where the rays diverge.
 

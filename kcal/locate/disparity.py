@@ -12,7 +12,7 @@ from kcal.checks import Float64Module, as_tensor, exportable, scalar
 from kcal.errors import InputError
 from kcal.lens.images import StereoRectification
 from kcal.locate.localizer import Localizer
-from kcal.texts import brief
+from kcal.texts import briefly
 
 # Pixels for the derivatives of resampling, whose curvature is far below that of lenses over a pixel.
 _STEP = 0.25
@@ -20,6 +20,7 @@ _STEP = 0.25
 _PIECE = 1 << 15
 
 
+@briefly
 @exportable
 class RangeImage(NamedTuple):
     """Distances from the left camera, meters, each (..., H, W).
@@ -37,9 +38,6 @@ class RangeImage(NamedTuple):
     low: Tensor
     high: Tensor
     valid: Tensor
-
-    def __repr__(self) -> str:
-        return brief(self)
 
 
 class DisparityRanges(Float64Module):

@@ -26,7 +26,7 @@ from kcal.locate.tables import (
     header_of,
     read_chunks,
 )
-from kcal.texts import brief, csv_line
+from kcal.texts import briefly, csv_line
 
 # The wide table has one line for each point that two cameras saw, the long one a line for each mark.
 PIXELS = ("left_u", "left_v", "right_u", "right_v")
@@ -44,6 +44,7 @@ _LEAST_SIGMA = 0.05
 _WHOLE = 1 << 24
 
 
+@briefly
 class Marks(NamedTuple):
     """What the cameras of a rig saw, a row for each point.
 
@@ -131,9 +132,6 @@ class Marks(NamedTuple):
         """The median of `sigmas`, px, so that one vague mark does not count for all; `sigma` without any mark."""
         found = self.sigmas(sigma).nanmedian()
         return float(found) if found.isfinite() else sigma
-
-    def __repr__(self) -> str:
-        return brief(self)
 
 
 def is_long(path: str | Path) -> bool:

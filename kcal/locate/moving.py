@@ -24,7 +24,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin
 from kcal.locate.survey import EARTH, LOCAL, place_sigma, places_of
 from kcal.locate.tables import TableRow, read_chunks
-from kcal.texts import unix_seconds
+from kcal.texts import brief, briefly, unix_seconds
 
 # Tracks of targets whose positions are known while they move: a drone with RTK, ships with AIS, aircraft with ADS-B.
 #
@@ -82,6 +82,8 @@ class MovingTrack:
         >>> ship.at(torch.tensor([2.5, 20.0])).points[:, 0].tolist()
         [12.5, nan]
     """
+
+    __repr__ = brief
 
     name: str
     times: Tensor
@@ -257,6 +259,8 @@ class Sighting:
         'blob'
     """
 
+    __repr__ = brief
+
     label: str
     camera: int
     times: Tensor
@@ -366,6 +370,7 @@ class Identity(NamedTuple):
     sigmas: float
 
 
+@briefly
 class MovingControl(NamedTuple):
     """Sightings as landmarks, one for each time of a track.
 

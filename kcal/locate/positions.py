@@ -18,6 +18,7 @@ from torch import Tensor
 
 from kcal.arrow import ArrowRows, arrow_table, wkb_points, wkb_polygon
 from kcal.checks import as_points
+from kcal.doors import shown_in_notebooks
 from kcal.errors import InputError
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import anchor, enu_to_geodetic, latitude_longitude
@@ -86,6 +87,7 @@ class Located(ArrowRows):
     """
 
     __repr__ = brief
+    _repr_html_ = shown_in_notebooks
 
     columns: PositionColumns
     cameras: tuple[Viewpoint, ...]

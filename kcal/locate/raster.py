@@ -16,6 +16,7 @@ from torch import Tensor
 from kcal.errors import FileError, InputError, with_extra
 from kcal.files import read_head, read_text
 from kcal.locate.geodesy import mean_radius
+from kcal.texts import brief
 
 # Of a raster, 1.6 GB as they are kept.
 _MOST_CELLS = 200_000_000
@@ -33,6 +34,8 @@ class Raster:
         into: latitude and longitude (degrees) to x, y of the raster's coordinate system; None where these are degrees.
         cell_m: the smaller side of a cell in the middle, meters.
     """
+
+    __repr__ = brief
 
     heights: NDArray[np.float64]
     to_cell: tuple[float, float, float, float, float, float]

@@ -19,6 +19,7 @@ from kcal.locate.ground import Ground
 from kcal.locate.mounting import station_mounting
 from kcal.locate.tables import TableRow, read_rows
 from kcal.locate.views import CommonErrors, PosedCameras, errors_by_camera, shared_pixels
+from kcal.texts import brief, briefly
 
 # What the ground hides: lines of sight over a surface of heights, with the Earth's curve and bent light.
 
@@ -166,6 +167,8 @@ class Site:
         0.05
     """
 
+    __repr__ = brief
+
     name: str
     origin: Origin
     heading_deg: float | None = None
@@ -193,6 +196,7 @@ class Site:
             raise InputError(f"site {self.name}: a camera needs a heading")
 
 
+@briefly
 class Area(NamedTuple):
     """Points of the ground, in rows from south to north.
 
@@ -246,6 +250,7 @@ class SitingMap(NamedTuple):
         return self.sees.sum(0)
 
 
+@briefly
 class RankedSite(NamedTuple):
     """A candidate, and what it would give.
 

@@ -18,7 +18,7 @@ from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera_like import unproject_each
 from kcal.lens.rig import Rig
 from kcal.locate.angular import EPIPOLE, triangulate_pairs
-from kcal.texts import brief
+from kcal.texts import brief, briefly
 
 # The 95 % interval of a range, from one over the range and its standard deviation.
 #
@@ -344,6 +344,7 @@ class Localization(NamedTuple):
         return range_where_ok(self.status, self.inverse_range)
 
 
+@briefly
 class Sensitivity(NamedTuple):
     """Slopes of the range, infinite where there is no range; at long range they are valid for small errors only.
 

@@ -22,7 +22,7 @@ from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.marks import PAIR, PIXELS, Marks, is_long, pixel_of, read_marks, refuse_wide
 from kcal.locate.tables import TableRow, guarded, read_rows
 from kcal.strict_json import MOST_BYTES, read_json, read_xml
-from kcal.texts import brief, csv_line
+from kcal.texts import briefly, csv_line
 
 # Read what was surveyed or is known of the surroundings of a rig from CSV files into its local frame.
 #
@@ -39,6 +39,7 @@ _TOGETHER, _APART = 0.5, 1.0
 _INFINITY_SIGMA = 1e-12
 
 
+@briefly
 class Survey(NamedTuple):
     """Named places with their uncertainty.
 
@@ -53,9 +54,6 @@ class Survey(NamedTuple):
     points: Tensor
     sigma: Tensor
     origin: Origin | None
-
-    def __repr__(self) -> str:
-        return brief(self)
 
 
 def read_survey(path: str | Path, origin: Origin | None = None, *, measured: bool = True) -> Survey:
@@ -152,6 +150,7 @@ def place_sigma(row: TableRow, what: str) -> tuple[float, float, float]:
     return level, level, up
 
 
+@briefly
 class MarkedLandmarks(NamedTuple):
     """Landmarks with their marks, and what has only one of the two."""
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from kcal.dispatch import CHUNK
 from kcal.errors import FileError
 from kcal.files import read_head
-from kcal.texts import brief
+from kcal.texts import briefly
 
 # Located pairs column by column: what files and tables are made of, without an object for each row.
 
@@ -41,6 +41,7 @@ TEXTS = ("name", "status", "reason")
 _LARGEST = sys.float_info.max
 
 
+@briefly
 class PositionColumns(NamedTuple):
     """Located pairs, column by column.
 
@@ -95,9 +96,6 @@ class PositionColumns(NamedTuple):
     def located(self) -> NDArray[np.bool_]:
         """(N,) which pairs have a position."""
         return np.isfinite(self.column("east_m"))
-
-    def __repr__(self) -> str:
-        return brief(self)
 
 
 def number_lines(values: NDArray[np.float64]) -> list[str]:

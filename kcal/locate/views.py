@@ -31,6 +31,7 @@ from kcal.locate.stereo import (
     range_interval,
     sight_lines,
 )
+from kcal.texts import briefly
 
 # Pixels of any subset of cameras to points with errors, each point on its own.
 #
@@ -43,6 +44,7 @@ from kcal.locate.stereo import (
 _UNCHECKED = 1e-9
 
 
+@briefly
 class PosedCameras(NamedTuple):
     """Cameras as they stand: points_cam = rotation @ (points - center).
 
@@ -84,6 +86,7 @@ class PosedCameras(NamedTuple):
         return Surroundings(up=(self.rotation @ self.up[..., None])[..., 0], bending=self.bending)
 
 
+@briefly
 class CommonErrors(NamedTuple):
     """What all marks of a camera have in common: K independent errors.
 

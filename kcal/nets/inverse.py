@@ -23,6 +23,7 @@ from kcal.lens.inverse import start_from, undo_tilt
 from kcal.lens.projection import from_pixels, plane_from_points, rays_from_plane
 from kcal.solve.lm import DenseLinearization, DenseProblem, LMOptions, minimize
 from kcal.solve.problem import Problem, Result, SolverStatus, State
+from kcal.texts import brief
 
 # Small fully connected networks as functions of one vector of weights, with closed-form Jacobians.
 #
@@ -298,6 +299,8 @@ class InverseFit:
         iterations: number of trial steps taken.
         status: why the training stopped.
     """
+
+    __repr__ = brief
 
     net: InverseNet
     rms: float

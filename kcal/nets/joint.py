@@ -27,6 +27,7 @@ from kcal.nets.inverse import (
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.problem import SolverStatus, State
 from kcal.solve.schur import SchurProblem
+from kcal.texts import brief
 
 # The paper's residual net as written (Eq. 11): from the distortion vector to corrections of all parameters.
 #
@@ -168,6 +169,8 @@ class JointFit:
         rms: the same with the corrected camera.
         inverse_rms: sqrt(mean ‖y1 - y4‖²) at the corners, pixels of the center of the image.
     """
+
+    __repr__ = brief
 
     residual: ResidualNet
     camera: Camera

@@ -22,7 +22,7 @@ from kcal.locate.localizer import Localizer
 from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views
 from kcal.pipeline.assignment import assign_groups
 from kcal.pipeline.detections import Anchor, Detections, box_anchors
-from kcal.texts import brief
+from kcal.texts import briefly
 
 # `AssociationOptions`: which detections may be of one object.
 
@@ -322,6 +322,7 @@ _SHIFT = 4
 MOST_BOXES = 2000
 
 
+@briefly
 class Association(NamedTuple):
     """Pairs of detections; K pairs of N left and M right ones.
 
@@ -338,9 +339,6 @@ class Association(NamedTuple):
     cost: Tensor
     ambiguous: Tensor
     possible: Tensor
-
-    def __repr__(self) -> str:
-        return brief(self)
 
 
 @torch.no_grad()
@@ -391,6 +389,7 @@ def associate(
     return Association(rows, columns, found.cost[0, rows, columns], found.ambiguous[0, rows], found.possible[0])
 
 
+@briefly
 @exportable
 class BoxPairs(NamedTuple):
     """Pairs of boxes of B time steps; nothing in it is NaN.
@@ -410,9 +409,6 @@ class BoxPairs(NamedTuple):
     ambiguous: Tensor
     left: Tensor
     right: Tensor
-
-    def __repr__(self) -> str:
-        return brief(self)
 
 
 class PairBoxes(StatedModule):

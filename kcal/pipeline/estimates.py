@@ -14,7 +14,7 @@ from kcal.locate.localizer import Localizer
 from kcal.locate.stereo import BEARING_SIGMAS, PositionStatus, flag_positions, range_interval, status_counts
 from kcal.pipeline.imm_filter import Summary
 from kcal.pipeline.measurements import product, rooted, squared
-from kcal.texts import brief
+from kcal.texts import brief, briefly
 
 # From what is believed of tracks in the rig frame to places and velocities on the Earth, with all their errors.
 
@@ -124,6 +124,7 @@ def track_states(
 # so that it stays in the smoothed covariance as it was.
 
 
+@briefly
 class SmoothedTrack(NamedTuple):
     """One track at the M time steps of its life.
 

@@ -16,6 +16,7 @@ from kcal.lens.pose import side_axes
 from kcal.locate.angular import LIGHT_HORIZON, Found, baseline_axes, first_seen, meeting_points, triangulate_angular
 from kcal.locate.localizer import Localizer
 from kcal.locate.views import CommonErrors, PosedCameras, sound_covariances
+from kcal.texts import briefly
 
 # Pixels of any subset of cameras as rows that are linear around where their lines of sight meet.
 #
@@ -517,6 +518,7 @@ class ClockPrior:
         return self.offset_sigma_s, self.drift_sigma, self.slope_sigma_s
 
 
+@briefly
 class ClockEstimate(NamedTuple):
     """What the tracks say of a camera's clock beside the first one's.
 

@@ -20,7 +20,7 @@ from kcal.errors import InputError
 from kcal.lens.rig import Rig
 from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
-from kcal.texts import brief
+from kcal.texts import brief, briefly
 
 # `ObjectViews`: objects of one time step, each with its pixels in those of a rig's cameras that saw it.
 
@@ -224,6 +224,7 @@ def mark_numbers(pixels: Tensor, seen: Tensor) -> NDArray[np.int64]:
     return np.array(numbers, dtype=np.int64).reshape(len(numbers), len(pixels)).T
 
 
+@briefly
 class PixelPairs(NamedTuple):
     """Matches of a batch of B pairs of images, padded to K each, for `Localizer(left, right, mask=mask)`.
 
@@ -348,6 +349,7 @@ class DisparityOptions:
             raise InputError("disparity options: min_score, max_rival and min_share lie between 0 and 1")
 
 
+@briefly
 @exportable
 class ObjectDisparities(NamedTuple):
     """Objects found in the right image; nothing in it is NaN.
@@ -367,9 +369,6 @@ class ObjectDisparities(NamedTuple):
     score: Tensor
     off_line: Tensor
     by_anchor: Tensor
-
-    def __repr__(self) -> str:
-        return brief(self)
 
 
 class ObjectDisparity(StatedModule):

@@ -36,6 +36,7 @@ from kcal.pipeline.measurements import (
     squared,
 )
 from kcal.pipeline.pairing import ObjectViews, mark_numbers
+from kcal.texts import brief, briefly
 
 # When tracks begin and end, and what is told of them.
 
@@ -61,6 +62,8 @@ class TrackOptions:
     Raises:
         InputError: a value that is not positive (`lasting_px` may be zero), or a forgetting before the losing.
     """
+
+    __repr__ = brief
 
     motions: tuple[imm.Motion, ...] = imm.MOTIONS
     switch_s: float = 20.0
@@ -109,6 +112,7 @@ class TrackRecord:
         return max(self.categories, key=lambda name: self.categories[name])
 
 
+@briefly
 class Tracks(NamedTuple):
     """The confirmed tracks at one time.
 
@@ -390,6 +394,10 @@ class Tracker:
         self.steps = track_steps(self.localize, self.options.lasting_px)
         if compiled:
             self.steps = compiled_steps(self.steps, len(rig), self.beliefs, self.shared.mixing)
+
+    def __repr__(self) -> str:
+        confirmed = sum(record.number > 0 for record in self.records)
+        return f"Tracker(time={self.time:.6f} s, {confirmed} tracks, {len(self.localize.rig)} cameras)"
 
     @torch.no_grad()
     def __call__(self, views: ObjectViews, time: float | None = None) -> Tracks:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import html
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from kcal.doors import shown_in_notebooks
 from kcal.finding import FAULTS, Finding, sorted_findings
 from kcal.locate.stereo import BEARING_SIGMAS
-from kcal.texts import counted_text, range_text, visible
+from kcal.texts import brief, counted_text, range_text
 from kcal.values import ranges_and_errors
 
 # What lessens each source, where no finding tells more.
@@ -118,6 +118,9 @@ class Verdict:
         (True, 'at 1 km the range is known to ±2 %; 5 % are required')
     """
 
+    __repr__ = brief
+    _repr_html_ = shown_in_notebooks
+
     subject: str
     answers: tuple[RangeAnswer, ...] = ()
     findings: tuple[Finding, ...] = ()
@@ -212,10 +215,6 @@ class Verdict:
             lines += [f"  {'met' if answer.ok else 'missed'}: {answer.text}" for answer in self.answers]
         lines.append(f"{'YES' if self.usable else 'NO'}{self.but and f', {self.but}'}: {self.reason}")
         return lines if self.usable else [*lines, f"next: {self.next_step}"]
-
-    def _repr_html_(self) -> str:
-        """In notebooks."""
-        return f"<pre>{html.escape(visible(chr(10).join(self.lines())))}</pre>"
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain numbers and texts, for JSON; a range that cannot be told has no sigma."""

@@ -26,6 +26,7 @@ from kcal.lens.pose import side_axes
 from kcal.lens.rig import Rig
 from kcal.scene.common_errors import line_errors, pose_variance_ratio, smooth_effects, with_common_errors
 from kcal.scene.refine import Stillness, refine_matches, still_there
+from kcal.texts import briefly
 
 # Match keypoints of two images along epipolar lines, both ways.
 
@@ -155,6 +156,7 @@ MOST, _FEWEST = 10_000, 60
 _UNIT_SIGMA = 1e-3
 
 
+@briefly
 class ImagePair(NamedTuple):
     """Two images of one time.
 
@@ -192,6 +194,7 @@ class PairCounts:
     used: int
 
 
+@briefly
 class SceneMatches(NamedTuple):
     """Matches of all pairs as features of unknown range, and what became of the others."""
 

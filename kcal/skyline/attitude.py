@@ -36,6 +36,7 @@ from kcal.skyline.horizon import (
     sky_border,
     terrain_horizon,
 )
+from kcal.texts import brief
 from kcal.threads import in_one_thread
 
 # How much errors of a raster, and its cells, change its horizon, because a horizon is the highest of many heights.
@@ -142,6 +143,8 @@ class SkylineAttitude:
         warnings: what to know of it.
         fit: the columns used, in bins, and the covariance about the camera's axes.
     """
+
+    __repr__ = brief
 
     rotation: Floats
     heading_deg: float
@@ -397,6 +400,8 @@ class SkylineImage:
         camera: number of the camera that took it.
         image: (H, W) gray levels.
     """
+
+    __repr__ = brief
 
     name: str
     camera: int

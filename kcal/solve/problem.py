@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.texts import brief
 
 # Losses that grow more slowly than the square, so that a few wrong measurements cannot spoil a solution.
 
@@ -147,6 +148,8 @@ class Result(Generic[S]):
         iterations: (...) int64, trial steps taken.
         history: (iterations + 1, ...) cost after each trial step, the start first.
     """
+
+    __repr__ = brief
 
     state: S
     cost: Tensor

@@ -18,6 +18,7 @@ from kcal.corners.video import read_frames
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 from kcal.stars.sky import EARTH_RATE, StarCatalog
+from kcal.texts import briefly
 from kcal.values import instant
 
 # Find stars in an image to a small part of a pixel, each with its own standard deviation.
@@ -41,6 +42,7 @@ _CROWDED = 5.0
 Floats = NDArray[np.float64]
 
 
+@briefly
 class DetectedStars(NamedTuple):
     """Stars in an image, the brightest first.
 

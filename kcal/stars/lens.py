@@ -40,6 +40,7 @@ from kcal.stars.lens_fit import (
 )
 from kcal.stars.night import SkyView, fit_attitude
 from kcal.stars.sky import Identification, StarCatalog, celestial_directions, identify, turn_between
+from kcal.texts import brief
 from kcal.threads import in_one_thread
 
 # One lens from boards and stars: boards tell the lens and its pupil where they were, stars the field at infinity.
@@ -285,6 +286,8 @@ class StarCamera:
         agreement: of the stars with the boards that calibrated the camera before; None where none did.
         joint: the calibration by boards, refined by the stars; None likewise.
     """
+
+    __repr__ = brief
 
     lens: StarLens
     images: tuple[int, ...]

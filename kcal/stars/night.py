@@ -24,6 +24,7 @@ from kcal.lens.turning import fit_turn, seen_turned
 from kcal.locate.mounting import attitude
 from kcal.stars.detect import DetectedStars, detect_stars
 from kcal.stars.sky import identify, turn_between
+from kcal.texts import brief
 from kcal.threads import in_one_thread
 
 # How a camera looks, from the named stars of one image: rotation, residuals of every star, and covariance.
@@ -230,6 +231,8 @@ class SkyView:
         kcal.errors.InputError: time_sigma -1.0: seconds, not below 0, are needed
     """
 
+    __repr__ = brief
+
     time: datetime.datetime | None = None
     origin: Origin | None = None
     air: night_sky.Air | None = None
@@ -288,6 +291,8 @@ class NamedStars:
         covariance: (3, 3) of the attitude about that frame's axes, rad², with clock, UT1 and air.
         warnings: what to doubt.
     """
+
+    __repr__ = brief
 
     detected: DetectedStars
     view: SkyView

@@ -69,6 +69,10 @@ class Watched:
         for row in rows:
             self.take(row)
 
+    def __repr__(self) -> str:
+        span = f" from {self.times[0]:.0f} to {self.times[-1]:.0f} s" if self.times else ""
+        return f"Watched({', '.join(self.rig.names)}, {len(self.times):,} measurements{span})"
+
     @classmethod
     def read(cls, path: str | Path, rig: Rig, *, since: float = -math.inf, until: float = math.inf) -> Self:
         """Read the history that `kcal watch` wrote, as far as it tells of times between two times.

@@ -33,6 +33,7 @@ from kcal.lens.rig import Rig
 from kcal.lens.uncertainty import carried_covariance
 from kcal.lens.views import new_pinhole
 from kcal.solve.lm import DenseProblem, LMOptions, minimize
+from kcal.texts import brief
 
 # Fit a parametric lens model to a calibrated camera, for programs that know only that model.
 
@@ -60,6 +61,8 @@ class RefittedCamera:
         >>> refit_camera(camera, "pinhole").largest > 1  # a pinhole is no lens
         True
     """
+
+    __repr__ = brief
 
     camera: Camera
     rms: float
@@ -162,6 +165,8 @@ class ExportedCameras:
         lost: what the cameras have and the files do not.
         notes: what a reader of the files should know.
     """
+
+    __repr__ = brief
 
     format: str
     paths: tuple[Path, ...]

@@ -124,8 +124,7 @@ class IntervalCheck:
         """Whether the intervals hold at all ranges, as far as so many refits tell."""
         return all(share + 2.0 * error >= ENOUGH for share, error in self.shares)
 
-    def __repr__(self) -> str:
-        return brief(self)
+    __repr__ = brief
 
 
 def _share_within(squares: Tensor, axes: int | tuple[int, ...]) -> Tensor:

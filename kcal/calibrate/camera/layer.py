@@ -380,7 +380,7 @@ class CalibrationLayer(StatedModule):
     @property
     def constants(self) -> object:
         """All that it is made with."""
-        return self.size, self.options, self.backward, self.corner_sigma
+        return self.size, vars(self.options), self.backward, self.corner_sigma
 
     def __call__(self, *args: Any, **kwargs: Any) -> CalibratedViews:
         """See `forward`."""

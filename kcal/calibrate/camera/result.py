@@ -19,6 +19,7 @@ from kcal.calibrate.problem.parameters import ParameterConstraints, natural_valu
 from kcal.calibrate.problem.state import warp_modes
 from kcal.calibrate.problem.views import among
 from kcal.corners.observations import Observations
+from kcal.doors import shown_in_notebooks
 from kcal.errors import InputError
 from kcal.finding import Finding, sentences
 from kcal.io.camera_file import CameraFile, camera_to_file, provenance
@@ -109,6 +110,8 @@ class CalibrationOptions:
             its warp) are found; one view is enough. Its lens model takes the place of `model`.
         solver: options of the Levenberg-Marquardt solver, with a parametric model.
     """
+
+    __repr__ = brief
 
     model: LensModel | str = HYBRID
     field: nn.Module | None = None
@@ -313,6 +316,7 @@ class CameraCalibrationResult(ArrowRows):
     """
 
     __repr__ = brief
+    _repr_html_ = shown_in_notebooks
 
     camera: Camera
     rms: float

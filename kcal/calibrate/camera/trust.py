@@ -28,6 +28,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.difference import CameraDifference, camera_difference
 from kcal.lens.uncertainty import ParaxialFocal, image_sigma, paraxial_focal
 from kcal.solve.lm import LMOptions
+from kcal.texts import brief
 from kcal.threads import in_one_thread
 
 # Views that each half must have: fewer often do not determine a camera.
@@ -111,6 +112,8 @@ class Examination:
         failures: what could not be checked, and why.
         plain: of a hybrid lens whose halves predict each other badly, how a plain lens predicts them.
     """
+
+    __repr__ = brief
 
     halves: tuple[HalvesDifference, ...]
     reference: CameraCalibrationResult | None

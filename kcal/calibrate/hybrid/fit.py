@@ -183,6 +183,8 @@ class FitOptions:
         training: of the network that the field is; None: it is not trained.
     """
 
+    __repr__ = brief
+
     modes: FieldModes | None = None
     board: Literal["printed", "exact"] | BoardPrior | MeasuredBoard = "printed"
     square: bool | None = None

@@ -271,8 +271,7 @@ class MeasuredBoard:
         rest = shapes - torch.einsum("bg,gkn->bkn", fitted, basis)
         return fitted, rest if places is None else rest[..., count:]
 
-    def __repr__(self) -> str:
-        return brief(self)
+    __repr__ = brief
 
 
 class BoardFile(NativeFile):

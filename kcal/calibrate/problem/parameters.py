@@ -14,6 +14,7 @@ from kcal.errors import InputError
 from kcal.gaussian import Gaussian
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import INTRINSICS, parameter_names
+from kcal.texts import brief
 
 # Residuals of the shared parameters alone: Gaussian priors, and barriers before folds and poles of a lens.
 
@@ -324,6 +325,8 @@ class ParameterConstraints:
         priors: name -> (mean, standard deviation), both in the parameter's units.
         coefficient_prior: a prior on all coefficients without one of their own, or None.
     """
+
+    __repr__ = brief
 
     fixed: Mapping[str, float] = dataclasses.field(default_factory=dict)
     tied: tuple[tuple[str, ...], ...] = ()

@@ -12,11 +12,14 @@ from torch import Tensor
 from kcal.calibrate.rig.source import Measurement, PosedCamera, require_positive
 from kcal.errors import InputError
 from kcal.lens.calibration import ItemResidual
+from kcal.texts import brief
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Baseline(Measurement):
     """A measured distance between the centers of two cameras, meters."""
+
+    __repr__ = brief
 
     kind = "baselines"
 
@@ -75,6 +78,8 @@ class Baseline(Measurement):
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class MeasuredPosition(Measurement):
     """A camera's projection center, measured (by GNSS, say): (3,) meters in the local frame and its (3,) sigmas."""
+
+    __repr__ = brief
 
     kind = "positions"
     absolute = True

@@ -17,6 +17,7 @@ from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.source import RigState
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, parameter_rows, relative_rows
+from kcal.doors import shown_in_notebooks
 from kcal.finding import Finding, sentences
 from kcal.io.rig_file import save_rig
 from kcal.lens.calibration import Exclusion, ItemResidual, RigCalibration, RigSource
@@ -62,6 +63,7 @@ class RigResult:
     """
 
     __repr__ = brief
+    _repr_html_ = shown_in_notebooks
 
     data: RigData
     cameras: tuple[Camera, ...]

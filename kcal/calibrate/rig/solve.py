@@ -39,6 +39,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, check_refraction
 from kcal.solve.lm import LMOptions
+from kcal.texts import brief
 from kcal.threads import in_one_thread
 
 # Leave out marks and corners at which a lens model has no ray.
@@ -209,6 +210,8 @@ class RigOptions:
         refraction_sigma: its standard deviation beforehand; 0 holds it.
         solver: options of the Levenberg-Marquardt solver; residuals are in sigmas.
     """
+
+    __repr__ = brief
 
     intrinsics: Literal["prior", "fixed", "free"] = "prior"
     board_warp: bool = False

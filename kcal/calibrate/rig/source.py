@@ -20,6 +20,7 @@ from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
 from kcal.lens.pose import Pose, step_rows
 from kcal.lens.projection import Projection, project_components
+from kcal.texts import brief
 
 # The state of a rig's adjustment.
 
@@ -126,6 +127,8 @@ class Effect:
         >>> Effect(name="the clock, 0.1 s", shift=0.1 * velocity[:, None].expand(1, 2, 3)).shift[0, 0].tolist()
         [0.5, 0.0, 0.0]
     """
+
+    __repr__ = brief
 
     name: str
     shift: Tensor | None = None

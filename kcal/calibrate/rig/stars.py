@@ -26,6 +26,7 @@ from kcal.checks import require_finite
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import Pose, side_axes
+from kcal.texts import brief
 
 
 def star_turns(effects: Sequence[Effect], stars: int, cameras: int) -> Tensor:
@@ -56,6 +57,8 @@ class StarSource(ItemSource):
     Raises:
         InputError: shapes that do not fit, or sigmas that are not positive.
     """
+
+    __repr__ = brief
 
     kind = "stars"
     checks: ClassVar[str] = f"{ItemSource.checks}, and time, zone and place of the night images"
