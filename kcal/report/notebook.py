@@ -43,29 +43,29 @@ def html_of(record: object) -> str | None:
 
 
 @html_of.register
-def _camera(camera: Camera) -> str | None:
-    return None if camera.params.ndim > 1 else _page(camera_blocks(*derived_camera(camera)))
+def _camera_html(camera: Camera) -> str | None:
+    return None if camera.params.ndim > 1 else _html_of_blocks(camera_blocks(*derived_camera(camera)))
 
 
 @html_of.register
 def _rig(rig: Rig) -> str:
-    return _page(rig_blocks(rig))
+    return _html_of_blocks(rig_blocks(rig))
 
 
 @html_of.register
 def _calibration(result: CameraCalibrationResult) -> str:
     advice = (f"next: {text}" for text in result.advice)
-    return _picture(calibration_figure(result)) + _page([*result.warnings, *advice])
+    return _picture_html(calibration_figure(result)) + _html_of_blocks([*result.warnings, *advice])
 
 
 @html_of.register
 def _solved_rig(result: RigResult) -> str:
-    return _picture(rig_figure(result)) + _page(result.warnings)
+    return _picture_html(rig_figure(result)) + _html_of_blocks(result.warnings)
 
 
 @html_of.register
 def _observations(seen: Observations) -> str:
-    return (_picture(coverage_figure(seen)) if seen.views else "") + _page(observations_blocks(seen))
+    return (_picture_html(coverage_figure(seen)) if seen.views else "") + _html_of_blocks(observations_blocks(seen))
 
 
 @html_of.register
@@ -78,10 +78,10 @@ def _located(located: Located) -> str:
         located = dataclasses.replace(located, columns=columns, feet=feet, rows=located.rows or count)
     reasons = [f"* {position.name}: {position.reason}" for position in located.positions if position.reason]
     note = f"Interval: {located.interval_note}. Positions are {located.frame}."
-    table = _page([located.count_note, position_rows(located), *reasons, note])
+    table = _html_of_blocks([located.count_note, position_rows(located), *reasons, note])
     if located.origin is None:
         return table
-    return _picture((positions_figure if located.feet is None else stations_figure)(located)) + table
+    return _picture_html((positions_figure if located.feet is None else stations_figure)(located)) + table
 
 
 @html_of.register
@@ -89,12 +89,12 @@ def _verdict(verdict: Verdict) -> str:
     return f"<pre>{page_text(chr(10).join(verdict.lines()))}</pre>"
 
 
-def _picture(figure: Figure) -> str:
+def _picture_html(figure: Figure) -> str:
     data = base64.b64encode(picture_bytes(figure)).decode()
     return f'<img alt="" style="max-width: 100%" src="data:image/png;base64,{data}">'
 
 
-def _page(blocks: Iterable[str | list[list[str]]]) -> str:
+def _html_of_blocks(blocks: Iterable[str | list[list[str]]]) -> str:
     """Lines as a paragraph, rows as a table whose head is the first."""
     parts, lines = [], list[str]()
     for block in [*blocks, []]:
