@@ -14,20 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+import kcal
 import kcal.sim.practice as practice
 from kcal.cli.console import err, out, print_styled, steps, tell_table, warn
 from kcal.errors import FileError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
-from kcal.io.camera_file import load_camera
 from kcal.io.images import write_png, write_video
 from kcal.io.rig_file import load_pair
-from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_to_geodetic
 from kcal.report.positions import save_site_sketch
 from kcal.report.practice_score import score_cameras, score_positions, score_rig, score_tracks
 from kcal.sim.scene import DemoScene, render_board, scene_views
-from kcal.stars.night import SkyView
-from kcal.stars.sky import StarCatalog
 from kcal.strict_json import MOST_BYTES, read_json
 from kcal.table import Table
 
@@ -93,10 +89,12 @@ def _template(name: str) -> str:
 
 def survey_text(scene: DemoScene) -> str:
     """The landmarks as a surveyor hands them over: latitude, longitude, ellipsoidal height, sigma in meters."""
-    origin = Origin(lat=scene.lat, lon=scene.lon, height=scene.height)
+    origin = kcal.Origin(lat=scene.lat, lon=scene.lon, height=scene.height)
     surveyed = scene.surveyed(scene.landmarks)
     lines = ["name,lat,lon,height,sigma"]
-    for name, (lat, lon, height) in zip(surveyed.names, enu_to_geodetic(surveyed.enu, origin).tolist(), strict=True):
+    for name, (lat, lon, height) in zip(
+        surveyed.names, kcal.locate.enu_to_geodetic(surveyed.enu, origin).tolist(), strict=True
+    ):
         lines.append(f"{name},{lat:.9f},{lon:.9f},{height:.3f},{scene.survey_sigma:g}")
     return "\n".join(lines) + "\n"
 
@@ -221,8 +219,8 @@ def _picture(site: practice.PracticeSite, side: practice.Side, path: Path, _: Ca
 
 def _night(site: practice.PracticeSite, side: practice.Side, path: Path, _: Callable[[], None]) -> None:
     importlib.import_module("erfa")
-    scene, catalog = site.scene, StarCatalog.bundled()
-    view = SkyView(time=NIGHT, origin=Origin(lat=scene.lat, lon=scene.lon, height=scene.height))
+    scene, catalog = site.scene, kcal.stars.StarCatalog.bundled()
+    view = kcal.stars.SkyView(time=NIGHT, origin=kcal.Origin(lat=scene.lat, lon=scene.lon, height=scene.height))
     write_png(path, practice.night_picture(site, side, view.directions(catalog), catalog.magnitude))
 
 
@@ -273,7 +271,7 @@ def practice_score(folder: Path) -> None:
     """
     truth = read_truth_file(folder)
     paths = {str(side): folder / f"{side}.camera.json" for side in practice.SIDES}
-    cameras = {side: load_camera(path) for side, path in paths.items() if path.exists()}
+    cameras = {side: kcal.load_camera(path) for side, path in paths.items() if path.exists()}
     _show("cameras", "Cameras: error over the image after the best-fit rotation", score_cameras(cameras, truth))
     rig = load_pair(folder / "rig.json") if (folder / "rig.json").exists() else None
     what = "Rig: error of ranges over the image, with marks that have no noise"

@@ -13,7 +13,7 @@ import torch
 import typer
 from typer.main import get_command
 
-from kcal.calibrate.rig.pairs import pair_by_name
+import kcal
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.console import out, print_label, print_styled, print_table, steps
 from kcal.cli.detect import detect_command
@@ -21,164 +21,123 @@ from kcal.cli.locate import locate_command
 from kcal.cli.options import Command, declared
 from kcal.cli.report import report_command
 from kcal.cli.rig import solve_command
-from kcal.corners.board import Board
 from kcal.corners.images import expand_images
-from kcal.corners.observations import Observations
 from kcal.errors import FileError
 from kcal.files import make_folder, write_atomic
 from kcal.io.images import write_png
 from kcal.io.rig_file import RigFile, load_pair
-from kcal.lens.rig import Rig
-from kcal.locate.geodesy import Origin
-from kcal.locate.localizer import Localizer
-from kcal.locate.marks import Marks, read_marks, write_marks
-from kcal.locate.points import locate_points
+from kcal.locate.marks import write_marks
 from kcal.locate.positions import interval_coverage
 from kcal.locate.survey import LOCAL, places_csv
-from kcal.report.judge_rig import rig_verdict
 from kcal.report.pages import Part, save_summary
 from kcal.report.tables import chance_text, diagonal_rows, truth_rows
-from kcal.report.verdict import Requirement
 from kcal.sim.scene import DemoScene, NamedPoints, mark_points, render_demo
 from kcal.texts import length_text
 
 # What the rig of the simulated site must do.
 REQUIREMENT = "5km:10%"
+SIDES = ("left", "right")
 
 
-def save_site_summary(
-    output: Path, scene: DemoScene, table: Sequence[Sequence[str]], chance: str, command: str
+def _save_summary(
+    output: Path, title: str, lead: str, came_out: Part, caption: str, cameras: Part, rig: Part, command: str
 ) -> None:
-    """Write `summary.html` for the simulated site.
+    """Write `summary.html`: parts of its own, the map with a caption, and the command that locates again."""
+    where = (
+        "Seen from above, north up; ranges are on a logarithmic scale. map.html beside this page can be moved and "
+        "zoomed."
+    )
+    again = (
+        "Print a board (kcal board), photograph it (kcal capture helps), and go on as the tutorial shows. This "
+        "locates the points again, from the files in this folder:"
+    )
+    seen = Part(heading="The map", text=(where,), pictures=((output / "map.png", caption),))
+    yourself = Part(heading="3. Do it yourself", text=(again,), code=command)
+    save_summary(output / "summary.html", title, lead, [came_out, seen, cameras, rig, yourself])
 
-    Args:
-        output: folder with the results.
-        scene: the truth.
-        table: true and estimated positions.
-        chance: how many intervals contain the truth, and how many misses are usual.
-        command: locates the targets again.
-    """
-    seen = [Observations.load(output / f"{side}.obs.json") for side in ("left", "right")]
-    found = sum(len(file.views) for file in seen)
+
+def _save_site_summary(output: Path, scene: DemoScene, table: list[list[str]], chance: str, command: str) -> None:
+    """That of the simulated site, with true and estimated positions and how many intervals contain the truth."""
+    found = sum(len(kcal.Observations.load(output / f"{side}.obs.json").views) for side in SIDES)
     file = RigFile.load(output / "rig.json")
-    rig = file.rig()
-    (answer,) = rig_verdict(rig, Requirement.parse(REQUIREMENT), mark_sigma=scene.mark_sigma).answers
+    rig, needs = file.rig(), kcal.report.Requirement.parse(REQUIREMENT)
+    (answer,) = kcal.report.rig_verdict(rig, needs, mark_sigma=scene.mark_sigma).answers
     calibration = math.hypot(answer.parts["lenses"], answer.parts["relative pose"])
-    true = float(scene.rig.baseline)
-    parts = [
-        Part(
-            heading="What came out",
-            text=(
-                f"May this rig be used? {'Yes' if answer.ok else 'No'}: {answer.text}. Noise in the marks makes "
-                f"±{length_text(answer.parts['marks'], digits=2)} of it, lenses and relative pose "
-                f"±{length_text(calibration, digits=2)}.",
-                f'{chance} "Across" is the error across the line of sight. The last column is the error that is left '
-                "when the marks have no noise: the share of the calibration.",
-            ),
-            table=tuple(map(tuple, table)),
+    came_out = Part(
+        heading="What came out",
+        text=(
+            f"May this rig be used? {'Yes' if answer.ok else 'No'}: {answer.text}. Noise in the marks makes "
+            f"±{length_text(answer.parts['marks'], digits=2)} of it, lenses and relative pose "
+            f"±{length_text(calibration, digits=2)}.",
+            f'{chance} "Across" is the error across the line of sight. The last column is the error that is left '
+            "when the marks have no noise: the share of the calibration.",
         ),
-        _map_part(output, "True positions, estimates, and the error of each range"),
-        Part(
-            heading="1. Each camera was calibrated",
-            text=(
-                f"A printed board was photographed {scene.near_views} times by each camera, and found in {found} of "
-                f"{2 * scene.near_views} pictures. The board is bent by 1 mm and stretched by 0.15 %; kcal measures "
-                f"that on the way. {_residuals_text(file)} The truth is a lens traced ray by ray through seven "
-                "pieces of glass that are not quite centered.",
-            ),
-            pictures=(
-                (output / "images" / "left-near" / "near-02.png", "One of the pictures"),
-                (output / "left.png", "Left camera: where corners were, and their residuals"),
-            ),
+        table=tuple(map(tuple, table)),
+    )
+    cameras = Part(
+        heading="1. Each camera was calibrated",
+        text=(
+            f"A printed board was photographed {scene.near_views} times by each camera, and found in {found} of "
+            f"{2 * scene.near_views} pictures. The board is bent by 1 mm and stretched by 0.15 %; kcal measures "
+            f"that on the way. {_residuals_text(file)} The truth is a lens traced ray by ray through seven "
+            "pieces of glass that are not quite centered.",
         ),
-        Part(
-            heading="2. The rig was solved",
-            text=(
-                f"{len(scene.landmarks.names)} landmarks, surveyed to {100 * scene.survey_sigma:g} cm and marked in "
-                f"both images, tell where the cameras stand and look. Baseline: "
-                f"{length_text(float(rig.baseline), digits=5)} (true {length_text(true, digits=5)}).",
-            ),
-            pictures=((output / "rig.png", "Residuals by source"),),
+        pictures=(
+            (output / "images" / "left-near" / "near-02.png", "One of the pictures"),
+            (output / "left.png", "Left camera: where corners were, and their residuals"),
         ),
-        _yourself_part(command),
-    ]
+    )
+    solved = Part(
+        heading="2. The rig was solved",
+        text=(
+            f"{len(scene.landmarks.names)} landmarks, surveyed to {100 * scene.survey_sigma:g} cm and marked in "
+            f"both images, tell where the cameras stand and look. Baseline: "
+            f"{length_text(float(rig.baseline), digits=5)} (true {length_text(float(scene.rig.baseline), digits=5)}).",
+        ),
+        pictures=((output / "rig.png", "Residuals by source"),),
+    )
     lead = (
         "kcal rendered a site whose truth is known, calibrated two cameras from their own pictures of a printed board, "
         "solved the rig, and located seven targets. Nothing but the pictures and a surveyor's list was used; the truth "
         "comes in only here, for the comparison."
     )
-    save_summary(output / "summary.html", "Two cameras, seven targets, 100 m to 5 km", lead, parts)
+    title, caption = (
+        "Two cameras, seven targets, 100 m to 5 km",
+        "True positions, estimates, and the error of each range",
+    )
+    _save_summary(output, title, lead, came_out, caption, cameras, solved, command)
 
 
-def save_pairs_summary(output: Path, table: Sequence[Sequence[str]], command: str) -> None:
-    """Write `summary.html` for a folder of pairs.
-
-    Args:
-        output: folder with the results.
-        table: the board's diagonal in each pair, known and located.
-        command: locates the corners again.
-    """
+def _save_pairs_summary(output: Path, table: list[list[str]], command: str) -> None:
+    """That of a folder of pairs, with the board's diagonal in each pair, known and located."""
     file = RigFile.load(output / "rig.json")
     pairs = 0 if file.calibration is None else file.calibration.pairs
-    parts = [
-        Part(
-            heading="What came out",
-            text=(
-                "Two opposite corners of the board were located in each pair. Their distance is known, so the table "
-                "shows how accurate the rig is at the distance of the board.",
-            ),
-            table=tuple(map(tuple, table)),
+    came_out = Part(
+        heading="What came out",
+        text=(
+            "Two opposite corners of the board were located in each pair. Their distance is known, so the table "
+            "shows how accurate the rig is at the distance of the board.",
         ),
-        _map_part(output, "The located corners, and the interval of each range"),
-        Part(
-            heading="1. Each camera was calibrated",
-            text=(_residuals_text(file),),
-            pictures=tuple(
-                (output / f"{side}.png", f"{side.capitalize()} camera: where corners were, and their residuals")
-                for side in ("left", "right")
-            ),
-        ),
-        Part(
-            heading="2. The rig was solved",
-            text=(f"From {pairs} pairs: baseline {length_text(float(file.rig().baseline), digits=5)}.",),
-        ),
-        _yourself_part(command),
-    ]
+        table=tuple(map(tuple, table)),
+    )
+    pictures = [(output / f"{side}.png", f"{side.capitalize()} camera: where corners were, and their residuals")
+                for side in SIDES]  # fmt: skip
+    cameras = Part(heading="1. Each camera was calibrated", text=(_residuals_text(file),), pictures=tuple(pictures))
+    solved = f"From {pairs} pairs: baseline {length_text(float(file.rig().baseline), digits=5)}."
+    rig = Part(heading="2. The rig was solved", text=(solved,))
     lead = "kcal found the board in your pictures, calibrated both cameras, solved the rig, and located its corners."
-    save_summary(output / "summary.html", f"Two cameras, {pairs} pairs of pictures", lead, parts)
+    title, caption = f"Two cameras, {pairs} pairs of pictures", "The located corners, and the interval of each range"
+    _save_summary(output, title, lead, came_out, caption, cameras, rig, command)
 
 
 def _residuals_text(file: RigFile) -> str:
-    cameras = zip(("left", "right"), [camera.calibration for camera in file.cameras], strict=True)
+    cameras = zip(SIDES, [camera.calibration for camera in file.cameras], strict=True)
     rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
     return f"RMS of the residuals: {rms}."
 
 
-def _map_part(output: Path, caption: str) -> Part:
-    return Part(
-        heading="The map",
-        text=(
-            "Seen from above, north up; ranges are on a logarithmic scale. map.html beside this page can be moved "
-            "and zoomed.",
-        ),
-        pictures=((output / "map.png", caption),),
-    )
-
-
-def _yourself_part(command: str) -> Part:
-    return Part(
-        heading="3. Do it yourself",
-        text=(
-            "Print a board (kcal board), photograph it (kcal capture helps), and go on as the tutorial shows. This "
-            "locates the points again, from the files in this folder:",
-        ),
-        code=command,
-    )
-
-
 # Steps that both demonstrations share: run a command, locate the points, list the results.
 
-SIDES = ("left", "right")
 _COMMANDS: dict[str, Callable[..., None]] = {
     "detect": detect_command, "calibrate": calibrate_command, "rig": solve_command, "locate": locate_command,
     "report": report_command,
@@ -235,7 +194,7 @@ def print_results(output: Path, command: str) -> None:
 
 
 def real_pairs(
-    output: Path, folder: Path, size: str, square: str, board: Board, origin: Origin | None, heading: float
+    output: Path, folder: Path, size: str, square: str, board: kcal.Board, origin: kcal.Origin | None, heading: float
 ) -> None:
     """Calibrate from a folder of pairs, and locate two opposite corners of each board, whose distance is known."""
     images = {side: _side_images(folder, side) for side in SIDES}
@@ -245,15 +204,15 @@ def real_pairs(
     run("rig", *cameras, "--pairs", *seen, "--keep-all", "-o", output / "rig.json")
 
     write_marks(output / "points.csv", _board_ends(output, board))
-    where = origin or Origin(lat=0.0, lon=0.0, height=0.0)
+    where = origin or kcal.Origin(lat=0.0, lon=0.0, height=0.0)
     command = locate_again(output, f"--site={where.lat},{where.lon},{where.height}", f"--heading={heading}")
-    marks = read_marks(output / "points.csv")
+    marks = kcal.locate.read_marks(output / "points.csv")
     rig = load_pair(output / "rig.json")
-    located = locate_points(Localizer(rig, origin=where, heading_deg=heading), marks)
+    located = kcal.locate_points(kcal.Localizer(rig, origin=where, heading_deg=heading), marks)
     out.print("\nThe board's diagonal, true against estimated")
     rows = diagonal_rows(located, board)
     print_table(rows)
-    save_pairs_summary(output, rows, command)
+    _save_pairs_summary(output, rows, command)
     if origin is None:
         print_label("note", "no --site was given: positions are placed at latitude 0, longitude 0")
     print_results(output, command)
@@ -269,16 +228,16 @@ def _side_images(folder: Path, side: str) -> list[Path]:
     return found
 
 
-def _board_ends(output: Path, board: Board) -> Marks:
+def _board_ends(output: Path, board: kcal.Board) -> kcal.locate.Marks:
     """The first and last corner of each board of the rig, where both cameras saw them."""
-    left, right = (Observations.load(output / f"{side}.obs.json") for side in SIDES)
+    left, right = (kcal.Observations.load(output / f"{side}.obs.json") for side in SIDES)
     record = RigFile.load(output / "rig.json").calibration
     assert record is not None
     # A board that one camera read from its other end has other corners there: its marks would not be the same point.
     used = set(record.per_pair_rms) - set(record.flipped)
     pairs = [
         pair
-        for pair in pair_by_name(left.names, right.names)
+        for pair in kcal.rig.pair_by_name(left.names, right.names)
         if any(name in used for name in (" ".join(pair), " ".join(dict.fromkeys(pair))))
     ]
     ends = [0, board.corners - 1]
@@ -289,7 +248,7 @@ def _board_ends(output: Path, board: Board) -> Marks:
     names = [f"{Path(pair[0]).stem} {word}" for pair in pairs for word in ("first", "last")]
     both = torch.isfinite(torch.cat(marks, 1)).all(-1)
     chosen = tuple(name for name, seen in zip(names, both.tolist(), strict=True) if seen)
-    return Marks.of_pair(chosen, marks[0][both], marks[1][both])
+    return kcal.locate.Marks.of_pair(chosen, marks[0][both], marks[1][both])
 
 
 # `kcal demo` without images: a simulated site from rendered boards to positions, and a page that explains it.
@@ -315,7 +274,7 @@ def simulated_site(output: Path, seed: int) -> None:
     _calibrate_both(output, {side: [output / "images" / f"{side}-near"] for side in SIDES}, size, lap)
     _write_places(output / "survey.csv", scene.surveyed(scene.landmarks), sigma=scene.survey_sigma)
     marks = scene.landmark_marks
-    write_marks(output / "landmarks.csv", Marks.of_pair(scene.landmarks.names, marks.left, marks.right))
+    write_marks(output / "landmarks.csv", kcal.locate.Marks.of_pair(scene.landmarks.names, marks.left, marks.right))
     run(
         "rig", *(output / f"{side}.camera.json" for side in SIDES),
         "--landmarks", output / "survey.csv", "--marks", output / "landmarks.csv", "--pixel-sigma", scene.mark_sigma,
@@ -326,12 +285,13 @@ def simulated_site(output: Path, seed: int) -> None:
     lap("rig")
 
     marks, targets = scene.target_marks, scene.targets
-    write_marks(output / "points.csv", Marks.of_pair(targets.names, marks.left, marks.right))
+    write_marks(output / "points.csv", kcal.locate.Marks.of_pair(targets.names, marks.left, marks.right))
     _write_places(output / "truth.csv", targets)
     command = locate_again(output, "--pixel-sigma", scene.mark_sigma, "--truth", output / "truth.csv")
     rig = load_pair(output / "rig.json")
+    localize = kcal.Localizer(rig, pixel_sigma=scene.mark_sigma)
     located, exact = (
-        locate_points(Localizer(rig, pixel_sigma=scene.mark_sigma), Marks.of_pair(targets.names, *pixels))
+        kcal.locate_points(localize, kcal.locate.Marks.of_pair(targets.names, *pixels))
         for pixels in ((marks.left, marks.right), (marks.true_left, marks.true_right))
     )
     lap("positions and maps")
@@ -345,18 +305,18 @@ def simulated_site(output: Path, seed: int) -> None:
     chance += f" {_more_draws(scene, rig)}"
     out.print(chance)
     run("report", output / "rig.json", "--require", REQUIREMENT, "--pixel-sigma", scene.mark_sigma)
-    save_site_summary(output, scene, rows, chance, command)
+    _save_site_summary(output, scene, rows, chance, command)
     times = [f"{name} {end - start:.1f} s" for (_, start), (name, end) in itertools.pairwise(laps.items())]
     out.print(f"Time: {', '.join(times)}, together {laps['positions and maps'] - laps['']:.1f} s.")
     print_results(output, command)
 
 
-def _more_draws(scene: DemoScene, rig: Rig) -> str:
+def _more_draws(scene: DemoScene, rig: kcal.Rig) -> str:
     """How many intervals of this rig contain the true range over many draws of the noise in the marks."""
     draws, targets = 200, scene.points_rig(scene.targets)
     marks = mark_points(scene.rig, targets.repeat(draws, 1), scene.mark_sigma, scene.generator(-30))
     ranges = targets.norm(dim=-1).repeat(draws)
-    localize = Localizer(rig, pixel_sigma=scene.mark_sigma)
+    localize = kcal.Localizer(rig, pixel_sigma=scene.mark_sigma)
     share = interval_coverage(localize, marks.left, marks.right, ranges)
     return f"With {draws} other draws of the noise in the marks, {100 * share:.0f} % of the intervals contain it."
 

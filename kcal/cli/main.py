@@ -17,7 +17,6 @@ from kcal.cli.batch import batch_command
 from kcal.cli.board import app as board
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.capture import capture_command
-from kcal.cli.check import check_command
 from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
 from kcal.cli.console import err, print_label, print_replaced, working
 from kcal.cli.demo import demo_command
@@ -28,15 +27,14 @@ from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
 from kcal.cli.mark import mark_command
 from kcal.cli.options import Command, declared
-from kcal.cli.place import place_command
 from kcal.cli.rectify import rays_command, rectify_command
-from kcal.cli.report import report_command
+from kcal.cli.report import check_command, report_command
 from kcal.cli.rig import app as rig
+from kcal.cli.rig import place_command, station_command
 from kcal.cli.settings import defaults_of, read_settings
 from kcal.cli.show import show_command
 from kcal.cli.sites import budget_command, sites_command
 from kcal.cli.stars import stars_command
-from kcal.cli.stations import station_command
 from kcal.cli.watch import watch_command
 from kcal.errors import KcalError
 from kcal.files import written_files

@@ -1,7 +1,11 @@
-"""`kcal report`: may this camera or rig be used, and one page that says why."""
+"""`kcal report` and `kcal check`: may this camera or rig be used, and are its error bars true?"""
 
 from __future__ import annotations
 
+import hashlib
+import io
+import math
+import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
@@ -10,16 +14,19 @@ import typer
 
 import kcal
 from kcal.cli import kinds
-from kcal.cli.console import print_styled, print_wrote, steps, tell
-from kcal.cli.inputs import CAMERA_OR_RIG, pixel_sigma_of, single_camera
-from kcal.cli.options import Several
+from kcal.cli.console import err, out, print_answer, print_styled, print_wrote, steps, tell, tell_table, warn
+from kcal.cli.inputs import CAMERA_OR_RIG, pixel_sigma_and_source, pixel_sigma_of, single_camera
+from kcal.cli.options import Kind, Several
 from kcal.cli.rig_sources import cameras_of_files, check_views_of
-from kcal.errors import InputError
+from kcal.errors import FileError, InputError
 from kcal.file_kind import file_kind
+from kcal.files import check_writable, read_bytes, write_atomic
+from kcal.table import Table
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from kcal.calibrate.camera.interval_check import IntervalCheck, Refit
     from kcal.calibrate.camera.result import CameraCalibrationResult
     from kcal.calibrate.rig.result import RigResult
     from kcal.finding import Finding
@@ -230,3 +237,302 @@ def _pairs(rig: kcal.Rig, observations: Sequence[Path]) -> tuple[tuple[Tensor, T
     except InputError as error:
         return None, str(error)
     return (boards.points, boards.pixels), ""
+
+
+# `kcal check`: are the error bars of a camera or a rig true, here and at these ranges?
+
+# Exit code of a run that was interrupted, as in all commands.
+_INTERRUPTED = 130
+# Bytes of a file of refits that is read.
+_LARGEST_RUN = 2**28
+# Seconds between two writes of what is done.
+_OFTEN = 5.0
+
+
+def check_command(
+    camera: kinds.CalibratedOrRig,
+    *,
+    ranges: kinds.Table | None = None,
+    marks: kinds.Marks | None = None,
+    pixel_sigma: kinds.PixelSigma | None = None,
+    observations: kinds.Observed | None = None,
+    distance: Several[kinds.Distance] | None = None,
+    against: kinds.Observed | None = None,
+    refits: Annotated[int, Kind(metavar="N", least=10)] = 100,
+    picture: kinds.Picture | None = None,
+    output: kinds.Output | None = None,
+) -> None:
+    """Are the error bars of a camera or a rig true, here and at my ranges? Yes or no.
+
+    Of a rig: points whose ranges you know (--ranges) are located, and all errors are compared jointly with what the rig
+    states. If they contradict it, yaw, scale or noise is named, whichever explains them best.
+
+    Of a camera: simulates its own capture again and again: its poses, corners, noise and motion, with true cameras and
+    boards drawn from what the calibration leaves open. Each is calibrated, and its error is compared with what the
+    camera file states, over the image and at each range. A hundred take about a minute.
+
+    That supposes that the model can describe lens and board. Two tests do not: halves of the views, and the default
+    lens where another was chosen, must agree with the camera; and so must a second capture (--against), which is
+    calibrated, too.
+
+    What is done is kept: after an interruption the same command continues.
+
+    The exit code is 0 if the intervals are true, 3 if they are not, 1 if that could not be measured, 130 if it was
+    interrupted.
+
+    **Examples**
+
+    `kcal check left.camera.json --distance 1km --picture check.png`
+
+    `kcal check left.camera.json --against december.obs.json`
+
+    `kcal check rig.json --ranges known.csv`
+
+    Args:
+        camera: Camera file from `kcal calibrate`, or rig file from `kcal rig`.
+        ranges: Of a rig: known ranges in meters from the left camera, and their standard deviations
+            (name,left_u,left_v,right_u,right_v,range,range_sigma).
+        marks: Where the pixels of --ranges are, by name, if they are not in the same table.
+        observations: What it was calibrated from; found beside the camera if not given.
+        distance: Of what you look at, one or more: 800, 5km, inf. Far away if not given.
+        against: A second capture of this camera: is it where the first one says?
+        refits: Captures to simulate.
+        picture: map of where the intervals are right.
+        output: File of the refits that are done (.npz); CAMERA.check.npz if not given.
+    """
+    of_camera = observations, distance, against, picture, output
+    if file_kind(camera) == "rig":
+        if ranges is None or any(of_camera):
+            raise InputError("a rig is checked against known ranges, --ranges, without options that are of a camera")
+        _check_ranges(camera, ranges, marks, pixel_sigma)
+        return
+    if ranges or marks:
+        raise InputError("--ranges and --marks are of a rig; give a rig file from kcal rig")
+    name = camera.name.removesuffix(".json").removesuffix(".camera")
+    kept = check_writable(output or camera.with_name(f"{name}.check.npz"), camera)
+
+    from kcal.calibrate.camera.interval_check import FEWEST, interval_check
+
+    at = distance or [math.inf]
+    result, options, fingerprint = _calibration_of(camera, observations)
+    done, whole = _all_refits(result, options, at, refits, fingerprint, kept)
+    if len(done) < FEWEST:
+        err.print(f"interrupted after {len(done)} of {refits} refits: too few to tell; {kept} has them", markup=False)
+        raise typer.Exit(_INTERRUPTED)
+    found = interval_check(result, at, done)
+    fine = _told_refits(found, len(done))
+    if whole:
+        fine = _told_views(result, options) and fine
+        if against is not None:
+            fine = _told_against(result, against, options, at) and fine
+    if picture is not None:
+        from kcal.report.calibration import interval_figure
+
+        print_wrote(kcal.report.save_picture(picture, interval_figure(found, result.observations, camera.name)))
+    print_wrote(kept)
+    if not whole:
+        err.print(f"interrupted after {len(done)} of {refits} refits; the same command continues", markup=False)
+        raise typer.Exit(_INTERRUPTED)
+    if not fine:
+        raise typer.Exit(NO)
+
+
+def _check_ranges(path: Path, ranges: Path, marks: Path | None, sigma: float | None) -> None:
+    """Print known and measured ranges, and whether they agree."""
+    from kcal.io.rig_file import load_pair
+    from kcal.locate.range_check import check_ranges, read_known_ranges
+
+    rig, points = load_pair(path), read_known_ranges(ranges, marks)
+    noise, note = pixel_sigma_and_source(sigma, rig)
+    found = check_ranges(rig, points.marks, points.ranges, points.sigmas, pixel_sigma=noise)
+    columns = {
+        "name": "point", "known_m": "known m", "sigma_m": "±", "measured_m": "measured m", "low_m": "low",
+        "high_m": "high", "pull": "error / σ",
+    }  # fmt: skip
+    numbers = (found.known, points.sigmas, found.measured, found.low, found.high, found.pulls)
+    rows = [
+        [name, *((value, f"{value:.4g}") for value in values[:-1]), (values[-1], f"{values[-1]:+.2f}")]
+        for name, *values in zip(found.names, *(column.tolist() for column in numbers), strict=True)
+    ]
+    tell_table("ranges", Table(columns, rows))
+    if note and points.marks.covariance is None:
+        out.print(note, markup=False)
+    print_answer(found.true, found.text)
+    tell(
+        true=found.true, chi2=found.chi2, points=len(rows), probability=found.probability,
+        causes=[cause._asdict() for cause in found.causes], findings=[one.content() for one in found.findings],
+    )  # fmt: skip
+    if not found.true:
+        raise typer.Exit(NO)
+
+
+def _calibration_of(
+    path: Path, observations: Path | None
+) -> tuple[CameraCalibrationResult, kcal.CalibrationOptions, str]:
+    """The calibration, with residuals and poses, which a camera file does not have; and the file's fingerprint."""
+    from kcal.report.judge_camera import other_views
+
+    camera = kcal.load_camera(path)
+    if camera.calibration is None or camera.calibration.known(camera.params.detach()) is None:
+        raise InputError(
+            f"{path}: the camera has no error bars that could be checked; calibrate it with kcal calibrate"
+        )
+    record = camera.calibration.record
+    name = record.observations if record else None
+    file = observations or path.parent / Path(name or "").name
+    if observations is None and not (name and file.exists()):
+        wanted = f" ({name})" if name else ""
+        raise InputError(f"{path}: its observations{wanted} are not beside it; name them with --observations")
+    result, options = calibrated_again(camera, file, "calibrating")
+    others, _ = other_views(camera, result)
+    if others:
+        raise InputError(f"{file}: {others[0].sentence}")
+    return result, options, camera.fingerprint
+
+
+def _all_refits(
+    result: CameraCalibrationResult,
+    options: kcal.CalibrationOptions,
+    ranges: list[float],
+    count: int,
+    fingerprint: str,
+    path: Path,
+) -> tuple[list[Refit], bool]:
+    """So many refits, those of an earlier run included; and whether these are all."""
+    from kcal.calibrate.camera.interval_check import GRID, simulated_refits
+
+    # That of the file: a calibration that is made again differs in the last digits.
+    text = repr((fingerprint, [view.pixels for view in result.observations.views], ranges, GRID))
+    key = hashlib.sha256(f"{kcal.__version__}{text}".encode()).hexdigest()[:16]
+    done = _kept_refits(path, key)[:count]
+    if done:
+        out.print(f"{len(done)} refits are done already ({path})", markup=False)
+    seen = {refit.seed for refit in done}
+    todo = [seed for seed in range(count) if seed not in seen]
+    saved, whole = time.monotonic(), True
+    try:
+        with steps("refits", count) as advance:
+            advance("", len(done))
+            for refit in simulated_refits(result, options, ranges, todo):
+                done.append(refit)
+                advance(f"{len(done)} of {count}")
+                if time.monotonic() - saved > _OFTEN:
+                    _keep_refits(path, key, done)
+                    saved = time.monotonic()
+    except KeyboardInterrupt:
+        whole = False
+    if todo and done:
+        _keep_refits(path, key, done)
+    return done, whole
+
+
+def _keep_refits(path: Path, key: str, refits: list[Refit]) -> None:
+    import numpy as np
+
+    data = io.BytesIO()
+    parts = {name: np.stack([np.asarray(getattr(one, name)) for one in refits]) for name in ("seed", "errors", "own")}
+    np.savez_compressed(data, allow_pickle=False, kcal=np.array("check"), key=np.array(key), **parts)
+    write_atomic(path, data.getvalue())
+
+
+def _kept_refits(path: Path, key: str) -> list[Refit]:
+    """The refits of an earlier run; none where the file is of another camera, other ranges or another version."""
+    import torch
+
+    from kcal.calibrate.camera.interval_check import Refit
+    from kcal.strict_formats import read_npz
+
+    if not path.exists():
+        return []
+    arrays = read_npz(read_bytes(path, _LARGEST_RUN), str(path), _LARGEST_RUN, "run of kcal check")
+    if str(arrays.get("kcal")) != "check":
+        raise FileError(f"{path}: not a file of kcal check; choose another name with -o")
+    if str(arrays.get("key")) != key:
+        warn(f"{path} has refits of another camera, capture, range or version of kcal; they are made anew")
+        return []
+    try:
+        parts = zip(
+            arrays["seed"].tolist(), *(torch.from_numpy(arrays[name]) for name in ("errors", "own")), strict=True
+        )
+        return [Refit(seed, errors, own) for seed, errors, own in parts]
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(f"{path}: damaged; remove it and start again") from error
+
+
+def _told_refits(found: IntervalCheck, count: int) -> bool:
+    """Print the answer."""
+    from kcal.report.calibration import range_label
+
+    columns = {
+        "range_m": "range", "share": "refits inside, %", "share_error": "±", "lowest_share": "lowest place, %",
+        "error_px": "error px, RMS", "stated_px": "stated px, RMS", "factor": "σ should be",
+    }  # fmt: skip
+    rows = []
+    parts = zip(found.ranges, found.shares, found.coverage, found.rms, found.factors, strict=True)
+    for at, (share, error), places, (seen, told), factor in parts:
+        lowest = float(places[places.isfinite()].min())
+        rows.append([
+            (at, range_label(at)), (share, f"{100 * share:.1f}"), (error, f"{100 * error:.1f}"),
+            (lowest, f"{100 * lowest:.0f}"), (seen, f"{seen:.3g}"), (told, f"{told:.3g}"),
+            (factor, f"x {factor:.2f}"),
+        ])  # fmt: skip
+    tell_table("ranges", Table(columns, rows))
+    if found.failed:
+        warn(f"{found.failed} of {count} simulated captures could not be calibrated; they are not counted")
+    worst = min(range(len(rows)), key=lambda i: found.shares[i][0])
+    share, where = 100 * found.shares[worst][0], range_label(found.ranges[worst])
+    if found.true:
+        text = f"the stated 95 % intervals are true: they contain {share:.0f} % of {count} refits, {where}"
+    else:
+        text = (
+            f"the stated 95 % intervals are too narrow: they contain {share:.0f} % of {count} refits, {where}; "
+            f"multiply σ by {found.factors[worst]:.2f}, or take more views"
+        )
+    print_answer(found.true, text)
+    tell(true=found.true, refits=count, failed=found.failed)
+    return found.true
+
+
+def _told_views(result: CameraCalibrationResult, options: kcal.CalibrationOptions) -> bool:
+    """Print whether the capture's own views contradict the intervals: by their halves, and by the default lens."""
+    from kcal.report.judge_camera import fault_of_views
+
+    with steps("examining the views", None) as advance:
+        fault = fault_of_views(result, options, advance)
+    if fault is None:
+        print_answer(True, "its own views say nothing against lens model and board")
+    else:
+        print_answer(False, f"its own views contradict the stated intervals: {fault.sentence}")
+    tell(fault=None if fault is None else fault.text)
+    return fault is None
+
+
+def _told_against(
+    result: CameraCalibrationResult, path: Path, options: kcal.CalibrationOptions, ranges: list[float]
+) -> bool:
+    """Print whether a second capture gives the same camera."""
+    from kcal.calibrate.camera.interval_check import against_capture
+    from kcal.report.calibration import range_label
+
+    second = kcal.Observations.load(path)
+    check_views_of([result.camera], [second], [path])
+    with steps(f"calibrating {path.name}", None):
+        found = against_capture(result, second, options, ranges)
+    columns = {
+        "range_m": "range", "seen_px": "seen px, RMS", "predicted_px": "predicted px, RMS",
+        "ratio": "seen / predicted", "probability": "probability",
+    }  # fmt: skip
+    rows = []
+    for at, one in zip(ranges, found, strict=True):
+        ratio, chance = one.ratio or math.nan, one.probability if one.probability is not None else math.nan
+        rows.append([
+            (at, range_label(at)), (one.rms, f"{one.rms:.3g}"), (one.rms / ratio, f"{one.rms / ratio:.3g}"),
+            (ratio, f"{ratio:.2f}"), (chance, f"{chance:.2g}"),
+        ])  # fmt: skip
+    tell_table("against", Table(columns, rows))
+    same = all(bool(one.same) for one in found)
+    verdict = "agrees with" if same else "contradicts"
+    more = "" if same else ": a lens or board that the model does not describe, or a camera that changed"
+    print_answer(same, f"the second capture {verdict} the stated intervals{more}")
+    tell(against_same=same)
+    return same

@@ -16,7 +16,7 @@ import pydantic
 import kcal
 from kcal.cli.console import out, print_table
 from kcal.cli.inputs import SHOWN
-from kcal.cli.stations import print_stands
+from kcal.cli.rig import print_stands
 from kcal.errors import FileError
 from kcal.file_kind import file_kind
 from kcal.files import read_bytes

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from kcal import Camera, InputError, Observations, Rig, load_camera, load_rig, save_camera, save_rig
 from kcal.cli.main import app
-from kcal.cli.stations import _exact_line
+from kcal.cli.rig import _exact_line
 from kcal.lens import CameraCalibration
 from kcal.locate.survey import read_survey
 

@@ -15,8 +15,7 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
-from kcal.cli.rig_options import Sources
-from kcal.cli.rig_sources import read_sources
+from kcal.cli.rig_sources import Sources, read_sources
 from kcal.io.camera_file import camera_to_file, save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import RigFile, load_rig

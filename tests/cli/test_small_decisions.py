@@ -15,9 +15,8 @@ from typer.testing import CliRunner, Result
 
 from kcal.cli.demo_practice import _first
 from kcal.cli.main import app
-from kcal.cli.rig_options import Sources
-from kcal.cli.rig_sources import READERS, RigReading, parse_baselines, read_sources
-from kcal.cli.stations import camera_names
+from kcal.cli.rig import camera_names
+from kcal.cli.rig_sources import READERS, RigReading, Sources, parse_baselines, read_sources
 from kcal.errors import InputError
 from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
