@@ -329,16 +329,13 @@ def _glass_before(t: Floats) -> Floats:
 UP = np.array([0.0, 0.0, 1.0])
 BLACK: Color = (34.0, 36.0, 40.0)
 WHITE: Color = (236.0, 236.0, 232.0)
-RED: Color = (168.0, 52.0, 42.0)
-ROCK: Color = (112.0, 106.0, 98.0)
-GRASS: Color = (92.0, 108.0, 72.0)
 Box = tuple[float, float, float, float]
 
 
 def box_outline(box: Box) -> Floats:
     """Corners (4, 2) of left, bottom, right, top."""
     left, bottom, right, top = box
-    return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+    return np.array([[left, bottom], [right, bottom], [right, top], [left, top]], dtype=np.float64)
 
 
 def facing(
@@ -349,8 +346,8 @@ def facing(
     angle = math.atan2(place[0], place[1]) + math.radians(turn)
     along = np.array([math.cos(angle), -math.sin(angle), 0.0])
     return Facet(
-        origin=place, along=along, up=UP, outline=outline, color=color, texture=texture, grain=grain, windows=windows,
-        top=top,
+        origin=place, along=along, up=UP, outline=np.asarray(outline, dtype=np.float64), color=color, texture=texture,
+        grain=grain, windows=windows, top=top,
     )  # fmt: skip
 
 
@@ -401,7 +398,7 @@ def building(
 
 
 def ridge(
-    bearings: tuple[float, float], distance: float, heights: Sequence[tuple[float, float]], foot: float, color: Color,
+    bearings: Sequence[float], distance: float, heights: Sequence[tuple[float, float]], foot: float, color: Color,
     *, heading: float, rough: float, texture: float = 0.25, grain: float = 20.0, seed: float = 0.0,
 ) -> Facet:  # fmt: skip
     """Land in front of the sky: an upright piece whose upper edge runs through heights, with rocks on it.
@@ -432,69 +429,14 @@ def ridge(
     return facing(place, box_outline((-half, foot, half, high)), color, texture=texture, grain=grain, top=top)
 
 
-def ground(box: Box, height: float, color: Color, *, heading: float, grain: float = 1.5) -> list[Facet]:
+def ground(box: Box, height: float, color: Color, *, heading: float, grain: float = 1.5) -> Facet:
     """Level land: left, near, right and far edge in meters to the right and ahead; its far edges have a low wall."""
     angle = math.radians(heading)
     right = np.array([math.cos(angle), -math.sin(angle), 0.0])
     ahead = np.array([math.sin(angle), math.cos(angle), 0.0])
-    return [
-        Facet(
-            origin=height * UP, along=right, up=ahead, outline=box_outline(box), color=color, texture=0.16, grain=grain
-        )
-    ]
-
-
-def ship(place: Floats, length: float, style: int, forward: float) -> list[Facet]:
-    """A ship at a place on the water: `forward` is 1 if it moves to the right, -1 to the left.
-
-    Args:
-        place: (3,) its middle, on the waterline.
-        length: meters.
-        style: 0 ferry, 1 trawler, 2 freighter, 3 sailing boat.
-        forward: 1 or -1.
-    """
-    parts = _STYLES[style]
-    found = []
-    for corners, color, windows in parts:
-        outline = length * np.array(corners)
-        outline[:, 0] *= forward
-        found.append(facing(place, outline, color, windows=windows))
-    return found
-
-
-def _rectangle(left: float, bottom: float, right: float, top: float) -> list[tuple[float, float]]:
-    return [(left, bottom), (right, bottom), (right, top), (left, top)]
-
-
-_Part = tuple[list[tuple[float, float]], Color, tuple[float, float] | None]
-# Pieces of ships of length 1, bow to the right.
-_STYLES: tuple[list[_Part], ...] = (
-    [
-        ([(-0.48, 0.0), (0.44, 0.0), (0.5, 0.08), (-0.5, 0.08)], (38.0, 58.0, 96.0), None),
-        (_rectangle(-0.44, 0.08, 0.36, 0.16), WHITE, (2.6, 2.4)),
-        (_rectangle(-0.3, 0.16, 0.24, 0.21), WHITE, (2.6, 2.4)),
-        (_rectangle(-0.2, 0.21, -0.08, 0.29), RED, None),
-        (_rectangle(0.12, 0.21, 0.135, 0.32), BLACK, None),
-    ],
-    [
-        ([(-0.46, 0.0), (0.4, 0.0), (0.5, 0.17), (-0.5, 0.11)], (150.0, 58.0, 40.0), None),
-        (_rectangle(-0.05, 0.12, 0.22, 0.34), WHITE, (2.2, 2.6)),
-        (_rectangle(-0.3, 0.1, -0.275, 0.42), BLACK, None),
-        (_rectangle(0.08, 0.34, 0.1, 0.44), BLACK, None),
-    ],
-    [
-        ([(-0.48, 0.0), (0.46, 0.0), (0.5, 0.08), (-0.49, 0.07)], (46.0, 44.0, 50.0), None),
-        (_rectangle(-0.46, 0.07, -0.33, 0.21), WHITE, (4.0, 3.4)),
-        (_rectangle(-0.42, 0.21, -0.37, 0.26), (196.0, 128.0, 40.0), None),
-        (_rectangle(-0.28, 0.07, 0.02, 0.13), (150.0, 66.0, 48.0), (6.2, 40.0)),
-        (_rectangle(0.05, 0.07, 0.38, 0.11), (58.0, 98.0, 128.0), (6.2, 40.0)),
-    ],
-    [
-        ([(-0.5, 0.02), (0.4, 0.0), (0.52, 0.1), (-0.5, 0.1)], WHITE, None),
-        ([(0.02, 0.14), (0.46, 0.14), (0.02, 1.1)], (232.0, 226.0, 210.0), None),
-        ([(-0.46, 0.17), (-0.01, 0.17), (-0.01, 1.16)], (226.0, 220.0, 204.0), None),
-    ],
-)  # fmt: skip
+    return Facet(
+        origin=height * UP, along=right, up=ahead, outline=box_outline(box), color=color, texture=0.16, grain=grain
+    )
 
 
 # What lies behind the pieces of a coast: sky with clouds, and the sea on a round Earth up to its horizon.
