@@ -206,7 +206,7 @@ VIDEO = dataclasses.replace(
 )
 FOREIGN = Wanted(
     "a file of another program",
-    frozenset({"camera", "rig", "foreign", "json", "unknown", "table", "survey", "marks", "geojson", "gpx"}),
+    frozenset({"camera", "rig", "foreign", "json", "image", "unknown", "table", "survey", "marks", "geojson", "gpx"}),
     "kcal import left.yaml -o left.camera.json",
     (("observations", _CALIBRATE),),
     part=True,

@@ -20,13 +20,11 @@ from torch import Tensor
 from kcal.checks import MOST_FOCAL
 from kcal.errors import FileError, InputError, KcalError
 from kcal.file_kind import check_pixel_count
-from kcal.files import read_text
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import Pose, nearest_rotation
 from kcal.lens.rig import Rig
-from kcal.strict_formats import MOST_YAML, read_yaml
 from kcal.texts import brief
 
 # Rotations of files with six digits; beyond it they are no rotation but a mistake.
@@ -220,7 +218,7 @@ def whole_size(width: Any, height: Any) -> tuple[int, int]:
 BEFORE = re.compile(r"(left|right|(?:cam(?:era)?)?[0-9])(.+)")
 # Keys of other things than a lens, and keys of a lens.
 OTHER = re.compile(
-    "err|rms|resid|uncert|^std|std$|sigma|view|(?<!principal)point|corner|board|square|pattern|marker|target|grid|time"
+    "err|rms|resid|uncert|^std|std$|sigma|view|object|(?<!principal)point|corner|board|square|pattern|marker|target|grid|time"
     "|date$|stamp|flag|extrin|pose|rotat|translat|rvec|tvec|quat|orient|posit|world|valid|^new|optimal|undist|rectif|^proj"
     "|essential|fundamental|fps|rate|name|path|file|version|count|^num|comment|note|desc|serial|id$|header|frame|gain"
     "|expos|aspect|bias|noise|gyro|acc|imu|body|base(?:line)?$|overlap|resolutions|transform|aabb|scene|bound|render|^(?:[rp][12]?|[qef]|om|h[12]|t[0-9a-z]{0,4})$"
@@ -317,11 +315,6 @@ def reading(path: str | Path, what: str) -> Iterator[None]:
         raise FileError(f"{path}: bad {what} file: {error.args[0]} is missing") from error
     except Exception as error:
         raise FileError(f"{path}: bad {what} file: {type(error).__name__}: {error!s:.200}") from error
-
-
-def load_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file; nothing in it is executed."""
-    return read_yaml(read_text(path, MOST_YAML), str(path))
 
 
 def dump_yaml(content: Mapping[str, Any]) -> str:

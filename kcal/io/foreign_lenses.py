@@ -125,12 +125,21 @@ def _fisheye(v: Sequence[Tensor], X: Tensor, Y: Tensor, Z: Tensor) -> Plane:
     return _bent(*_on_angles(X, Y, Z), v[:4], v[4:])
 
 
+def _modified(v: Sequence[Tensor], X: Tensor, Y: Tensor, Z: Tensor) -> Plane:
+    """RealSense's: tangential terms of what radial ones give, but r of the ray."""
+    x, y, there = _at_depth(X, Y, Z)
+    square, (a, b, _) = x * x + y * y, _bent(x, y, (v[0], v[1], v[4]))
+    across = a + 2.0 * v[2] * a * b + v[3] * (square + 2.0 * a * a)
+    return across, b + 2.0 * v[3] * a * b + v[2] * (square + 2.0 * b * b), there
+
+
 _THETA = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
 # Names of Metashape in the order of OpenCV, whose p1 is its p2.
 _PARTIAL = ("k1", "k2", "k3", "k4", "p2", "p1", "p3", "p4")
 _MOST_XI = 100.0
 # Mei and Rives 2007 (omni-radtan, OpenCV's omnidir), Usenko et al. 2018 (ds), Khomutenko et al. 2016 (eucm), Devernay
-# and Faugeras 2001 (fov), Fitzgibbon 2001 (division), COLMAP's and OpenSfM's documentation, Metashape's manual.
+# and Faugeras 2001 (fov), Fitzgibbon 2001 (division), COLMAP's and OpenSfM's documentation, Metashape's manual,
+# librealsense's rsutil.h.
 LENSES = {
     "omni-radtan": ForeignLens(("xi", "k1", "k2", "p1", "p2"), _omni, ((-1, _MOST_XI),), ((0.0,), (1.0,), (2.0,))),
     "ds": ForeignLens(("xi", "alpha"), _double_sphere, ((-1, 1), (0, 1)), ((-0.2, 0.55), (0.1, 0.5))),
@@ -141,6 +150,7 @@ LENSES = {
     "rad-tan-thin-prism": ForeignLens((*_THETA[:6], "p0", "p1", *_THETA[8:]), _rad_tan_thin_prism),
     "dual": ForeignLens(("transition", "k1", "k2"), _dual, ((-1e-9, 1 + 1e-9),), ((0.5,),)),
     "frame with p3, p4": ForeignLens(_PARTIAL, _frame),
+    "modified_brown_conrady": ForeignLens(("k1", "k2", "p1", "p2", "k3"), _modified),
     "fisheye with p1 to p4": ForeignLens(_PARTIAL, _fisheye),
 }  # fmt: skip
 

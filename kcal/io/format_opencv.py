@@ -25,7 +25,6 @@ from kcal.io.foreign import (
     core_of,
     dump_yaml,
     known_size,
-    load_yaml,
     named_camera,
     numbers,
     paths_for,
@@ -37,7 +36,7 @@ from kcal.io.keyed import flat, read_keyed
 from kcal.lens.camera import Camera
 from kcal.lens.pose import Pose, vector_from_rotation
 from kcal.opencv import cv2
-from kcal.strict_formats import read_mat, read_npz, read_storage
+from kcal.strict_formats import read_mat, read_npz, read_storage, read_yaml
 from kcal.strict_json import read_json
 
 # OpenCV's YAML, XML and JSON files of one camera or a stereo pair, as its samples write and read them.
@@ -90,10 +89,30 @@ def write_opencv(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -
 
 
 def read_ros(path: Path, hints: Hints) -> ImportedCameras:
-    """Read one camera, and how it is rectified; YAML, or the text that the calibrator calls `ost.txt`."""
+    """Read a camera, and how it is rectified: YAML, echoed messages, or the calibrator's text, `ost.txt`."""
     text = read_text(path, MOST_BYTES)
-    content = _sections(text) if ROS_TEXT.search(text) else load_yaml(path)
-    found = read_keyed(content, str(content.get("camera_name") or path.stem), hints, "ros")
+    if ROS_TEXT.search(text):
+        return _ros_camera(_sections(text), path.stem, hints)
+    # Messages of one camera differ in their times alone.
+    timeless = re.sub(r"\A\s*%YAML:.*|^[ \t]*(?:seq|n?secs?|nanosec): .*", "", text, flags=re.MULTILINE)
+    parts = list(dict.fromkeys(part.strip() for part in re.split(r"^---[ \t]*$", timeless, flags=re.MULTILINE)))
+    contents = [read_yaml(part, str(path)) for part in parts if part]
+    if len(contents) == 1:
+        return _ros_camera(contents[0], path.stem, hints)
+    found = [_ros_camera(each, str(each["header"]["frame_id"]), hints) for each in contents]
+    names = [camera_name(each.cameras[0], "") for each in found]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"messages of {twice[0]} differ: leave those of one calibration in the file")
+    return dataclasses.replace(
+        found[0],
+        cameras=tuple(each.cameras[0] for each in found),
+        poses=tuple(pose for each in found for pose in each.poses),
+        notes=tuple(dict.fromkeys(note for each in found for note in each.notes)),
+    )
+
+
+def _ros_camera(content: Mapping[str, Any], name: str, hints: Hints) -> ImportedCameras:
+    found = read_keyed(content, str(content.get("camera_name") or name), hints, "ros")
     turn, projected = (
         flat(content.get(long, content.get(short, content.get(short.lower()))))
         for long, short in (("rectification_matrix", "R"), ("projection_matrix", "P"))

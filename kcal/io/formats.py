@@ -13,8 +13,10 @@ from typing import Any
 import torch
 
 from kcal.errors import FileError, InputError
+from kcal.file_kind import is_image
 from kcal.files import read_bytes, read_head, read_text
 from kcal.io import (
+    format_devices,
     format_kalibr,
     format_mrcal,
     format_opencv,
@@ -157,6 +159,12 @@ FORMATS = {
     ),
     "qualisys": CameraFormat(title="Qualisys .qca.txt", models=(), read=format_photos.read_qualisys, poses=0),
     "agisoft": CameraFormat(title="Agisoft Metashape XML", models=(), read=format_photos.read_agisoft, poses=0),
+    "device": CameraFormat(
+        title="depthai, Azure Kinect, RealSense, ZED, EuRoC, KITTI, Open3D, nuScenes, photos of DJI's drones",
+        models=(),
+        read=format_devices.read_device,
+        poses=0,
+    ),
     "gtsam": _prior_format("gtsam", "Values and noise model for GTSAM, JSON", format_prior.GTSAM_MODELS),
     "ceres": _prior_format("ceres", "A and b of Ceres's NormalPrior, JSON", format_prior.PLAIN_MODELS),
     "numpy": _prior_format("numpy", "Parameters and their square-root information, .npz", format_prior.PLAIN_MODELS),
@@ -212,9 +220,13 @@ def recognized(path: Path) -> str:
     if suffix == ".npz":
         # Names of arrays are in clear in an archive.
         return "numpy" if b"kcal_prior" in read_bytes(path, MOST_BYTES) else "opencv"
+    if is_image(read_head(path, 4096)):
+        return "device"
     text = read_text(path, MOST_BYTES)
     if format_opencv.ROS_TEXT.search(text):
         return "ros"
+    if format_devices.device_of(text):
+        return "device"
     if suffix == ".toml" or _SECTION.match(text):
         return "toml"
     # mrcal's files begin with comments.
@@ -232,6 +244,9 @@ def recognized(path: Path) -> str:
         return (
             "ros" if re.search(r"^(distortion_model|(rectif|project)\w+_matrix)\s*:", text, re.MULTILINE) else "opencv"
         )
+    other = next((program for program, mark in _UNREAD_TEXT.items() if re.search(mark, text, re.MULTILINE)), "")
+    if other:
+        raise FileError(f"{path}: a file of {other}, which kcal does not read; copy its numbers into one of Kalibr")
     raise FileError(f"{path}: not a camera file that kcal knows; name its format (--format {', '.join(FORMATS)})")
 
 
@@ -258,7 +273,12 @@ def _json_format(path: Path, text: str) -> str:
 
 
 # Keys that JSON files of a format have, and of programs whose files are not read.
-_UNREAD = {"value0": "Basalt or cereal", "cameraData": "DepthAI", "views": "Meshroom", "sfm_data_version": "OpenMVG"}
+_UNREAD = {"value0": "Basalt or cereal", "views": "Meshroom", "sfm_data_version": "OpenMVG"}
+_UNREAD_TEXT = {
+    "OCamCalib": "^#polynomial coefficients for the DIRECT", "Bundler": r"\A# Bundle file", "VisualSFM": r"\ANVM_V3",
+    "Hugin or PTGui": "^# (?:hugin|ptGui) project file", "Pix4D": r"\APix4D", "RealityCapture": r"\bxcr:",
+    "DSO": r"\A(?:Pinhole|RadTan|EquiDistant|FOV|KannalaBrandt)(?:\s+[-+.\de]+){4}",
+}  # fmt: skip
 _JSON = {
     "kcal": {"kcal"}, "ceres": {"kcal_prior"}, "nerfstudio": {"fl_x", "frames", "camera_angle_x"},
     "matlab": {"RadialDistortion", "IntrinsicMatrix", "CameraParameters1"},

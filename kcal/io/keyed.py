@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 import torch
+from torch.nn.functional import pad
 
 from kcal.io.foreign import (
     BEFORE,
@@ -31,7 +32,7 @@ from kcal.io.foreign import (
     whole_size,
     with_sigmas,
 )
-from kcal.io.foreign_lenses import foreign_camera
+from kcal.io.foreign_lenses import foreign_camera, nearest_hybrid
 from kcal.lens.camera import Camera
 from kcal.lens.camera_conversions import OPENCV_MODELS, ImageTransform
 from kcal.lens.pose import Pose, rotation_from_vector
@@ -74,8 +75,8 @@ _FOREIGN = re.compile(
     ".*(fish|omni|spher|ucm|mei|fov|divis|scara|ocam|poly|radial|prism|cahv|pano|equi|ortho|unified|brown)|ds|kb"
 )
 _OMNI = re.compile("omni(?:dir|directional)?|mei")
-# Of RealSense; they are no lens of kcal unless all coefficients are zero.
-_ZERO = re.compile(".*(?:inverse|modified)brownconrady")
+# Of RealSense, as `_realsense` calls them; without distortion where all coefficients are zero.
+_REALSENSE = {"inversebrownconrady": "inverse", "modifiedbrownconrady": "modified_brown_conrady", "ftheta": "fov"}
 
 
 def _role(key: str, value: Any) -> tuple[str, str] | None:
@@ -144,8 +145,8 @@ class _Named:
             raise ValueError(f"{' and '.join(missing)} of the principal point are missing")
         return [fx, self.number("fy", side, fx), self.number("cx", side), self.number("cy", side)], 0.0
 
-    def kind(self, side: str, fisheye: bool | None, notes: list[str]) -> bool | None:
-        """Whether the lens is a fisheye's; None if the file does not say.
+    def kind(self, side: str, fisheye: bool | None, notes: list[str]) -> bool | str | None:
+        """Whether the lens is a fisheye's, or the name of one of RealSense's; None if the file does not say.
 
         Raises:
             ValueError: a lens that is neither, or keys that contradict each other.
@@ -156,10 +157,12 @@ class _Named:
             if where not in ("", side) or role.split()[0] not in ("kind", "fisheye"):
                 continue
             value = self.keys[key]
-            text = bare(value)
+            text = re.sub("^(?:(?:rs2)?distortion|lensmodel)", "", bare(value))
             if role == "fisheye":
                 said[value not in (0, "0", "no", "No") and text not in ("false", "00")] = key
-            elif _FISHEYE.fullmatch(text) or _PLAIN.fullmatch(text) or (_ZERO.fullmatch(text) and not bent):
+            elif text in _REALSENSE and bent and fisheye is None:
+                return _REALSENSE[text]
+            elif _FISHEYE.fullmatch(text) or _PLAIN.fullmatch(text) or text in _REALSENSE:
                 said[bool(_FISHEYE.fullmatch(text))] = f"{key} {value}"
             elif text in ("none", "null") and bent:
                 raise ValueError(f"{key} {value}, but there are coefficients that are not zero; delete one of them")
@@ -256,6 +259,8 @@ def _flattened(content: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in content.items():
         block = isinstance(value, Mapping) and "data" not in value and _role(key, value) is None
+        # PhotonVision's board has a size, too.
+        block = block and "object" not in bare(key)
         if block and any(map(_role, value, value.values())):
             if twice := set(found) & set(value):
                 raise ValueError(
@@ -277,8 +282,10 @@ def _camera(named: _Named, side: str, name: str, hints: Hints, notes: list[str])
     matrix = named.key("matrix", side)
     fisheye = named.kind(side, hints.fisheye, notes)
     stated = named.get("lens", side)
-    lens = _coefficients(named, side, bool(fisheye)) if stated is None else (flat(stated) or [])
+    lens = _coefficients(named, side, fisheye is True) if stated is None else (flat(stated) or [])
     key = named.key("lens", side) if stated is not None else "the coefficients k1, k2, p1, p2"
+    if isinstance(fisheye, str):
+        return _realsense(fisheye, named_camera(name, core, size, "pinhole"), numbers(lens, 5, key), notes)
     if fisheye and len(lens) > 4 and not any(lens[4:]):
         lens = lens[:4]
     if named.get("xi", side) is not None:
@@ -305,6 +312,31 @@ def _camera(named: _Named, side: str, name: str, hints: Hints, notes: list[str])
         given = numbers(sigmas, (4 + len(lens), 18), named.key("sigmas", side))
         notes.append(with_sigmas(camera, given[: 4 + len(lens)]))
     return camera if hints.size else _delivered(named, side, camera, notes)
+
+
+def _realsense(kind: str, like: Camera, lens: list[float], notes: list[str]) -> Camera:
+    """A lens of librealsense: its inverse one says where the ray of a distorted point is, as its documentation says."""
+    name = camera_name(like, "camera")
+    if kind != "inverse":
+        if kind == "fov" and any(lens[1:]):
+            raise ValueError("ftheta with more than one coefficient, which is not RealSense's: kcal does not read it")
+        own = lens[:1] if kind == "fov" else lens
+        camera, note = foreign_camera(kind, name, like.params[:4].tolist(), like.size, own)
+        notes.append(note)
+        return camera
+    straight = Camera.build(focal=(1, 1), center=(0, 0), size=(2, 2), coefficients=lens, model="opencv5")
+
+    def rays(pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        found, good = straight.project(pad(like.normalize(pixels)[0], (0, 1), value=1.0))
+        return pad(found, (0, 1), value=1.0), good
+
+    camera, note = nearest_hybrid(rays, like, "its inverse_brown_conrady lens")
+    corner = torch.tensor(like.size, dtype=torch.float64)[None] - 1.0
+    off = 2.0 * float((like.project(rays(corner)[0])[0] - corner).norm())
+    notes += [note, f"{name}: inverse_brown_conrady is read as RealSense documents it, from distorted points to rays; "
+              "librealsense computes it as modified_brown_conrady since version 2.45, some "
+              f"{off:.2g} px away in a corner: write that name into the file if it is meant"]  # fmt: skip
+    return camera
 
 
 def _coefficients(named: _Named, side: str, fisheye: bool) -> list[float]:

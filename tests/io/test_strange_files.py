@@ -545,11 +545,10 @@ def test_pairs(tmp_path: Path, keys: str) -> None:
 
 
 def test_sections_of_an_ini_are_cameras(tmp_path: Path) -> None:
-    """As a ZED's SN12345.conf has them."""
-    text = "".join(f"[{side}_CAM_HD]\nfx={f}\nfy=505\ncx=330\ncy=236\nk1=-0.1\nk2=0.02\np1=0\np2=0\nk3=0\n\n"
+    text = "".join(f"[{side}_EYE]\nfx={f}\nfy=505\ncx=330\ncy=236\nk1=-0.1\nk2=0.02\np1=0\np2=0\nk3=0\n\n"
                    for side, f in (("LEFT", 500), ("RIGHT", 501)))  # fmt: skip
-    found = import_cameras(written(tmp_path, "SN1.conf", text + "[STEREO]\nBaseline=120\n"), size=(640, 480))
-    assert found.names == ("LEFT_CAM_HD", "RIGHT_CAM_HD")
+    found = import_cameras(written(tmp_path, "eyes.conf", text + "[STEREO]\nBaseline=120\n"), size=(640, 480))
+    assert found.names == ("LEFT_EYE", "RIGHT_EYE")
     assert [camera.params[:6].tolist() for camera in found.cameras] == [[f, 505, 330, 236, 0, -0.1] for f in (500, 501)]
     assert found.notes == ()
 
