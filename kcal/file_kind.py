@@ -72,10 +72,10 @@ def file_kind(path: str | Path) -> str:
 
 
 def _foreign_kind(path: Path, head: bytes, size: int) -> str:
-    if any(head[place:].startswith(mark) for place, mark in _VIDEO) and not is_heif(head):
-        return "video"
     if is_image(head):
         return "image"
+    if any(head[place:].startswith(mark) for place, mark in _VIDEO):
+        return "video"
     text = head.decode("utf-8-sig", errors="replace").lstrip()
     if "\0" in text:
         return "foreign" if path.suffix.lower() in (".mat", ".bin", ".npz", ".pb") else "unknown"
@@ -169,8 +169,8 @@ def check_image_header(data: bytes, source: str | Path) -> Size:
 
 
 def is_image(data: bytes) -> bool:
-    """Whether bytes begin like an image of a known format."""
-    if is_heif(data):
+    """Whether bytes begin like an image of a known format, or a raw one that does not begin like TIFF."""
+    if is_heif(data) or data.startswith(_RAW) or data[4:12] == b"ftypcrx ":
         return True
     start, size_of = next(((start, of) for start, of in _FORMATS.items() if data.startswith(start)), (b"", None))
     if size_of is None:
@@ -182,6 +182,10 @@ def is_image(data: bytes) -> bool:
         return all(0 < side < 2**20 for side in size_of(data))
     except (struct.error, IndexError, TypeError, ValueError):
         return False
+
+
+# Of Fujifilm, Panasonic and Olympus.
+_RAW = (b"FUJIFILMCCD-RAW", b"IIU\0", b"IIRO", b"IIRS", b"MMOR")
 
 
 def is_heif(data: bytes) -> bool:

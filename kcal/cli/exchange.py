@@ -123,7 +123,7 @@ def import_command(
     Args:
         sources: File of another program, FILE:NAME for one of its cameras; two files of a pair.
         output: Camera or rig file to write.
-        format: opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, qualisys or agisoft.
+        format: opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, qualisys, agisoft or device.
         size: Image size, where the file has none or a wrong one.
         fisheye: Whether four coefficients of OpenCV are a fisheye's.
         board: Read corners instead, of a board with these inner corners.

@@ -2,21 +2,26 @@
 
 Pixels are always in the order in which the sensor wrote them. An EXIF orientation tag is ignored: a phone that was
 turned between two shots would otherwise swap width and height, and the lens does not turn with the tag.
+
+Raw images are developed here, by LibRaw, so that no pixel moves: all pixels of the sensor that are exposed (a few more
+than the camera's own JPEG has, with another principal point), linear in the light, black subtracted, white as the
+camera balanced it. Colors are interpolated linearly between neighbors of the same color on both sides: methods that
+follow edges shift them. No lens is corrected.
 """
 
 from __future__ import annotations
 
 import datetime
 import glob
-import importlib
+import importlib.util
 import io
 import os
 import re
 import tempfile
 import threading
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +40,9 @@ Gray = npt.NDArray[np.uint8 | np.uint16]
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm", ".jp2"})
 # Those that need Pillow's plug-in, and those that must be developed first.
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".avif"})
-RAW_SUFFIXES = frozenset({".cr2", ".cr3", ".nef", ".arw", ".dng", ".orf", ".rw2", ".raf", ".pef", ".srw"})
+RAW_SUFFIXES = frozenset(
+    {".cr2", ".cr3", ".nef", ".nrw", ".arw", ".dng", ".orf", ".rw2", ".raf", ".pef", ".srw", ".3fr", ".iiq", ".x3f"}
+)
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"})
 MIN_IMAGE_SIDE = 16
 
@@ -199,6 +206,10 @@ def _natural(paths: Iterable[Path]) -> list[Path]:
 
 
 def _decoded(data: bytes, source: str | Path, flags: int) -> npt.NDArray[Any]:
+    if Path(source).suffix.lower() in RAW_SUFFIXES:
+        colors = _developed(data, source)
+        way = cv2.COLOR_RGB2BGR if flags == cv2.IMREAD_UNCHANGED else cv2.COLOR_RGB2GRAY
+        return np.asarray(cv2.cvtColor(colors, way))
     if is_heif(data):
         picture = _opened_heif(data, source)
         stored = picture.transpose(_UNDONE[turns]) if (turns := _heif_turns(data)) else picture
@@ -224,14 +235,45 @@ def image_header(data: bytes, source: str | Path) -> tuple[int, int]:
         FileError: no image that can be read, with what to do.
     """
     if Path(source).suffix.lower() in RAW_SUFFIXES:
-        raise FileError(
-            f"{source}: a raw image, which has to be developed first: take the JPEG that the camera stored with it, or "
-            "save it as TIFF without corrections of the lens (darktable-cli, dcraw -T)"
-        )
+        with _opened_raw(data, source) as (_, raw):
+            return int(raw.sizes.width), int(raw.sizes.height)
     if not is_heif(data):
         return check_image_header(data, source)
     width, height = _opened_heif(data, source).size
     return (height, width) if _heif_turns(data) % 2 else (width, height)
+
+
+@contextmanager
+def _opened_raw(data: bytes, source: str | Path) -> Iterator[tuple[Any, Any]]:
+    """rawpy, and a raw image in it."""
+    try:
+        rawpy = importlib.import_module("rawpy")
+    except ImportError:
+        raise FileError(
+            f"{source}: a raw image, which needs one more package: pip install 'kcal[images]'; or take the JPEG that "
+            "the camera stored with it, of all images alike"
+        ) from None
+    try:
+        with rawpy.imread(io.BytesIO(data)) as raw:
+            check_pixel_count((raw.sizes.width, raw.sizes.height))
+            yield rawpy, raw
+    except (rawpy.LibRawError, rawpy.NotSupportedError, ValueError) as error:
+        text = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
+        raise FileError(
+            f"{source}: a raw image that LibRaw cannot read ({text}); save it as TIFF without corrections of the lens"
+        ) from error
+
+
+def _developed(data: bytes, source: str | Path) -> npt.NDArray[np.uint16]:
+    """RGB (H, W, 3) of a raw image, as the head of this module says."""
+    with _opened_raw(data, source) as (rawpy, raw):
+        colors = raw.postprocess(
+            demosaic_algorithm=rawpy.DemosaicAlgorithm.LINEAR, output_color=rawpy.ColorSpace.raw, use_camera_wb=True,
+            gamma=(1, 1), no_auto_bright=True, adjust_maximum_thr=0.0, output_bps=16, user_flip=0,
+        )  # fmt: skip
+        if colors.shape[:2] != (raw.sizes.height, raw.sizes.width):
+            raise ValueError("its pixels are not square, or lie obliquely, and would have to be resampled")
+    return np.ascontiguousarray(np.broadcast_to(colors, (*colors.shape[:2], 3)))
 
 
 # Quarter turns to the left that a decoder of HEIC carries out, as the file's box `irot` says, and how to undo them.
@@ -246,8 +288,10 @@ def _opened_heif(data: bytes, source: str | Path) -> Image.Image:
     try:
         picture = Image.open(io.BytesIO(data))
     except UnidentifiedImageError:
+        if importlib.util.find_spec("pillow_heif"):
+            raise FileError(f"{source}: the image is truncated or corrupt; copy it again or leave it out") from None
         raise FileError(
-            f"{source}: a HEIC image, which needs one more package: pip install pillow-heif; or convert it to PNG"
+            f"{source}: a HEIC image, which needs one more package: pip install 'kcal[images]'; or convert it to PNG"
         ) from None
     check_pixel_count(picture.size)
     return picture

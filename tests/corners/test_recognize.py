@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -167,7 +168,15 @@ def test_many_images_that_failed_are_one_line_and_a_file(
     assert not (tmp_path / "y.left-out.txt").exists()
 
 
-def test_raw_and_heic_images_of_a_folder_are_named_with_what_to_do(tmp_path: Path) -> None:
+@pytest.mark.parametrize("there", [False, True])
+def test_raw_and_heic_images_of_a_folder_are_named_with_what_to_do(
+    tmp_path: Path, there: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("rawpy", "pillow_heif"):
+        if there:
+            pytest.importorskip(module)
+        else:
+            monkeypatch.setitem(sys.modules, module, None)
     page = shots(Board.parse("9x6", "25mm"), 0.4, TILTS[0])[0]
     write_png(tmp_path / "a.png", page)
     for name in ("a.CR2", "b.CR2", "c.heic"):
@@ -179,8 +188,12 @@ def test_raw_and_heic_images_of_a_folder_are_named_with_what_to_do(tmp_path: Pat
     seen = detect(tmp_path, Board.parse("9x6", "25mm"), note=lambda _: None)
     raw, heic = seen.failures
     assert (raw.name, heic.name) == ("b.CR2", "c.heic")
-    assert "a raw image, which has to be developed first" in raw.reason
-    assert heic.reason.startswith("a HEIC image, which needs one more package: pip install pillow-heif")
+    words = ("a raw image that LibRaw cannot read", "the image is truncated or corrupt") if there else (
+        "a raw image, which needs one more package: pip install 'kcal[images]'",
+        "a HEIC image, which needs one more package: pip install 'kcal[images]'",
+    )  # fmt: skip
+    assert raw.reason.startswith(words[0])
+    assert heic.reason.startswith(words[1])
 
 
 @pytest.mark.parametrize(("turns", "orientation"), [(0, 1), (1, 8), (2, 3), (3, 6)])

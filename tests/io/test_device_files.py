@@ -246,7 +246,7 @@ class TestRealSense:
     def test_the_text_of_rs_enumerate_devices(self, tmp_path: Path) -> None:
         def intrinsic(stream: str, size: str, lens: str, coeffs: Any) -> str:
             width, height = size.split("x")
-            return (f' Intrinsic of "{stream}" / {size} / {{YUYV/RGB8}}\n  Width:      \t{width}\n  Height:     \t{height}\n'
+            return (f' Intrinsic of "{stream}" / {size} / {{YUYV}}\n  Width: \t{width}\n  Height:     \t{height}\n'
                     f"  PPX:        \t635\n  PPY:        \t356\n  Fx:         \t640\n  Fy:         \t641\n"
                     f"  Distortion: \t{lens}\n  Coeffs:     \t{'  '.join(map(str, coeffs))}  \n"
                     "  FOV (deg):  \t90.1 x 58.7\n\n")  # fmt: skip
@@ -313,7 +313,8 @@ def test_two_files_of_euroc_are_a_rig(tmp_path: Path) -> None:
     for name, whole in (("cam0", first), ("cam1", second)):
         text = ("# General sensor definitions.\nsensor_type: camera\ncomment: VI-Sensor cam0 (MT9M034)\n\n"
                 f"T_BS:\n  cols: 4\n  rows: 4\n  data: {whole.ravel().tolist()}\n\nrate_hz: 20\n"
-                "resolution: [752, 480]\ncamera_model: pinhole\nintrinsics: [458.654, 457.296, 367.215, 248.375] #fu, fv, cu, cv\n"
+                "resolution: [752, 480]\ncamera_model: pinhole\n"
+                "intrinsics: [458.654, 457.296, 367.215, 248.375] #fu, fv, cu, cv\n"
                 f"distortion_model: radial-tangential\ndistortion_coefficients: {D[:4]}\n")  # fmt: skip
         paths.append(written(tmp_path, f"{name}/sensor.yaml", text))
     found = import_cameras(*paths)
@@ -474,7 +475,7 @@ def test_photonvision(tmp_path: Path) -> None:
                "distCoeffs": matrix(1, 8, FOURTEEN[:8]), "calobjectWarp": [1e-4, -2e-4],
                "calobjectSize": {"width": 8.0, "height": 8.0},
                "calobjectSpacing": 0.0254, "lensmodel": "LENSMODEL_OPENCV",
-               "observations": [{"locationInObjectSpace": [{"x": 0.0, "y": 0.0, "z": 0.0}], "snapshotName": "a.png"}]}  # fmt: skip
+               "observations": [{"locationInObjectSpace": [{"x": 0.0, "y": 0.0, "z": 0.0}], "name": "a"}]}  # fmt: skip
     camera = import_cameras(written(tmp_path, "camera.json", content)).cameras[0]
     assert camera.size == (1280, 720)
     assert off(seen(camera), opencv(K, FOURTEEN[:8])) < 1e-9
@@ -537,8 +538,8 @@ class TestEchoed:
     def test_the_ini_of_the_calibrator(self, tmp_path: Path) -> None:
         rows = "\n".join(" ".join(map(str, row)) for row in K)
         text = (f"# oST version 5.0 parameters\n\n\n[image]\n\nwidth\n1280\n\nheight\n720\n\n"
-                f"[narrow]\n\ncamera matrix\n{rows}\n\ndistortion\n{' '.join(map(str, D))}\n\nrectification\n1 0 0\n0 1 0\n0 0 1\n\nprojection\n"
-                "800 0 640.5 0\n0 801 401.25 0\n0 0 1 0\n")  # fmt: skip
+                f"[narrow]\n\ncamera matrix\n{rows}\n\ndistortion\n{' '.join(map(str, D))}\n\n"
+                "rectification\n1 0 0\n0 1 0\n0 0 1\n\nprojection\n800 0 640 0\n0 801 401 0\n0 0 1 0\n")  # fmt: skip
         found = import_cameras(written(tmp_path, "ost.ini", text))
         assert (found.format, found.names) == ("ros", ("narrow",))
         assert off(seen(found.cameras[0]), opencv(K, D)) < 1e-9
@@ -548,7 +549,7 @@ class TestEchoed:
     ("name", "content", "program"),
     [
         ("a.json", {"views": [], "intrinsics": []}, "Meshroom"),
-        ("calib_results.txt", "#polynomial coefficients for the DIRECT mapping function (ocam_model.ss).\n5\n", "OCamCalib"),
+        ("calib_results.txt", "#polynomial coefficients for the DIRECT mapping function.\n5\n", "OCamCalib"),
         ("bundle.out", "# Bundle file v0.3\n1 2\n", "Bundler"),
         ("a.nvm", "NVM_V3\n\n2\n", "VisualSFM"),
         ("p.pto", "# hugin project file\np f2 w3000\n", "Hugin"),
