@@ -72,10 +72,11 @@ def file_kind(path: str | Path) -> str:
 
 
 def _foreign_kind(path: Path, head: bytes, size: int) -> str:
+    still = is_heif(head) or head[4:12] == b"ftypcrx "
+    if any(head[place:].startswith(mark) for place, mark in _VIDEO) and not still:
+        return "video"
     if is_image(head):
         return "image"
-    if any(head[place:].startswith(mark) for place, mark in _VIDEO):
-        return "video"
     text = head.decode("utf-8-sig", errors="replace").lstrip()
     if "\0" in text:
         return "foreign" if path.suffix.lower() in (".mat", ".bin", ".npz", ".pb") else "unknown"

@@ -29,12 +29,12 @@ Found = tuple[dict[str, dict[str, Any]], list[str]]
 _MOST = 256 * 2**20
 
 
-def _posed(part: dict[str, Any], pose: Pose) -> None:
+def _give_pose(part: dict[str, Any], pose: Pose) -> None:
     """Give a camera its pose from the frame of the file."""
     part |= {"R": plain(pose.rotation), "T": plain(pose.translation)}
 
 
-def _matrix(values: Any, columns: int, what: str) -> np.ndarray:
+def _stated_matrix(values: Any, columns: int, what: str) -> np.ndarray:
     return np.array(numbers(values, (12, 16) if columns == 4 else 9, what)).reshape(-1, columns)
 
 
@@ -69,7 +69,7 @@ def _depthai(text: str, path: Path, hints: Hints) -> Found:
         ends[name] = end, whole.inverse()
     if len({end for end, _ in ends.values()} - set(steps)) == 1 and len(cameras) > 1:
         for name, (_, pose) in ends.items():
-            _posed(cameras[name], pose)
+            _give_pose(cameras[name], pose)
     return cameras, notes
 
 
@@ -112,12 +112,12 @@ def _azure(text: str, path: Path, hints: Hints) -> Found:
         center = {"cx": cx * sensor[0] - left - 0.5, "cy": cy * sensor[1] - top - 0.5}
         lengths = {"fx": fx * sensor[0], "fy": fy * sensor[1], "width": size[0], "height": size[1]}
         cameras[name] = center | lengths | {"D": [*radial[:2], p1, p2, *radial[2:]], "lens_model": kind}
-        _posed(cameras[name], checked_pose(numbers(own["Rt"]["Rotation"], 9, "Rotation"), own["Rt"]["Translation"]))
+        _give_pose(cameras[name], checked_pose(numbers(own["Rt"]["Rotation"], 9, "Rotation"), own["Rt"]["Translation"]))
     notes = [] if hints.size else ["cameras of the whole sensors: say --size 1920x1080 for images of such a mode"]
     return cameras, notes
 
 
-def _realsense(text: str, path: Path, hints: Hints) -> Found:
+def _enumerated(text: str, path: Path, hints: Hints) -> Found:
     """What `rs-enumerate-devices -c` prints; a camera for each stream and size."""
     cameras: dict[str, dict[str, Any]] = {}
     for part in re.split(r"^[ \t]*Intrinsic of ", text, flags=re.MULTILINE)[1:]:
@@ -165,8 +165,8 @@ def _zed(text: str, path: Path, hints: Hints) -> Found:
     if pose.get("baseline"):
         rotation = rotation_from_vector(torch.tensor(turn, dtype=torch.float64))
         shift = 1e-3 * torch.tensor([-pose["baseline"], ty, tz], dtype=torch.float64)
-        _posed(cameras["left"], Pose.still())
-        _posed(cameras["right"], Pose(rotation, shift))
+        _give_pose(cameras["left"], Pose.still())
+        _give_pose(cameras["right"], Pose(rotation, shift))
         if ty or tz:
             turned = 2e3 * np.hypot(ty, tz) / pose["baseline"]
             notes.append("the signs of TY and TZ are those of Stereolabs' calibration; its sample for OpenCV exchanges "
@@ -177,9 +177,9 @@ def _zed(text: str, path: Path, hints: Hints) -> Found:
 def _euroc(text: str, path: Path, hints: Hints) -> Found:
     """T_BS leads from the sensor to the body; the files of two cameras are a rig."""
     content = dict(read_yaml(text, str(path)))
-    whole = _matrix(content.pop("T_BS"), 4, "T_BS")
+    whole = _stated_matrix(content.pop("T_BS"), 4, "T_BS")
     name = path.parent.name if path.stem == "sensor" else path.stem
-    _posed(content, checked_pose(whole[:3, :3].tolist(), whole[:3, 3].tolist()).inverse())
+    _give_pose(content, checked_pose(whole[:3, :3].tolist(), whole[:3, 3].tolist()).inverse())
     return {name: content | {"name": name}}, []
 
 
@@ -202,12 +202,14 @@ def _kitti(text: str, path: Path, hints: Hints) -> Found:
         notes = [f"cameras of raw images; for rectified ones (_sync): --size {wide:.0f}x{high:.0f}"] if wide else []
         return cameras, notes if hints.size is None else []
     for key in rectified:
-        projection = _matrix(given[key], 4, key)
+        projection = _stated_matrix(given[key], 4, key)
         size = given.get(key.replace("P", "S"), hints.size)
         if hints.size not in (None, tuple(size or ())):
             raise ValueError(f"no camera of {hints.size}; rectified images have {size}")
         part = {"K": projection[:, :3].ravel().tolist(), "size": known_size(hints.size) if size is None else size}
-        _posed(part, checked_pose(np.eye(3).tolist(), np.linalg.solve(projection[:, :3], projection[:, 3]).tolist()))
+        _give_pose(
+            part, checked_pose(np.eye(3).tolist(), np.linalg.solve(projection[:, :3], projection[:, 3]).tolist())
+        )
         cameras["camera_" + re.sub(r"\D", "", key)] = part
     return cameras, ["rectified cameras, without distortion"]
 
@@ -219,11 +221,11 @@ def _open3d(text: str, path: Path, hints: Hints) -> Found:
     cameras: dict[str, dict[str, Any]] = {}
     for number, item in enumerate(items):
         own = item.get("intrinsic", item)
-        part = {"K": _matrix(own["intrinsic_matrix"], 3, "intrinsic_matrix").T.ravel().tolist(),
+        part = {"K": _stated_matrix(own["intrinsic_matrix"], 3, "intrinsic_matrix").T.ravel().tolist(),
                 "width": own["width"], "height": own["height"]}  # fmt: skip
         if "extrinsic" in item and len(items) == 1:
-            whole = _matrix(item["extrinsic"], 4, "extrinsic").T
-            _posed(part, checked_pose(whole[:3, :3].tolist(), whole[:3, 3].tolist()))
+            whole = _stated_matrix(item["extrinsic"], 4, "extrinsic").T
+            _give_pose(part, checked_pose(whole[:3, :3].tolist(), whole[:3, 3].tolist()))
         if part not in cameras.values():
             cameras[f"camera_{number}" if len(items) > 1 else path.stem] = part
     return cameras, ["the poses of the trajectory are not kept"] if len(items) > 1 else []
@@ -241,7 +243,7 @@ def _nuscenes(text: str, path: Path, hints: Hints) -> Found:
             length = float(np.linalg.norm(axis))
             turn = 2.0 * np.arctan2(length, w) / (length or 1.0) * np.array(axis)
             rotation = rotation_from_vector(torch.from_numpy(turn))
-            _posed(part, checked_pose(plain(rotation), numbers(one["translation"], 3, "translation")).inverse())
+            _give_pose(part, checked_pose(plain(rotation), numbers(one["translation"], 3, "translation")).inverse())
         cameras[str(one["token"])] = part
     return cameras, [] if single else ["cameras of several vehicles or logs: their poses are not read"]
 
@@ -250,7 +252,7 @@ def _nuscenes(text: str, path: Path, hints: Hints) -> Found:
 _READERS: dict[str, tuple[str, Callable[[str, Path, Hints], Found]]] = {
     "depthai": (r'"cameraData"\s*:', _depthai),
     "Azure Kinect": (r'"CalibrationInformation"\s*:', _azure),
-    "RealSense": (r'^[ \t]*Intrinsic of "', _realsense),
+    "RealSense": (r'^[ \t]*Intrinsic of "', _enumerated),
     "ZED": (r"^\[LEFT_CAM_\w+\]", _zed),
     "EuRoC": (r"^T_BS\s*:", _euroc),
     "KITTI": (r"^(?:P0|P_rect_0\d|K_0\d):", _kitti),

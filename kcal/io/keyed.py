@@ -75,7 +75,7 @@ _FOREIGN = re.compile(
     ".*(fish|omni|spher|ucm|mei|fov|divis|scara|ocam|poly|radial|prism|cahv|pano|equi|ortho|unified|brown)|ds|kb"
 )
 _OMNI = re.compile("omni(?:dir|directional)?|mei")
-# Of RealSense, as `_realsense` calls them; without distortion where all coefficients are zero.
+# Of RealSense, as `_realsense_lens` calls them; without distortion where all coefficients are zero.
 _REALSENSE = {"inversebrownconrady": "inverse", "modifiedbrownconrady": "modified_brown_conrady", "ftheta": "fov"}
 
 
@@ -285,7 +285,7 @@ def _camera(named: _Named, side: str, name: str, hints: Hints, notes: list[str])
     lens = _coefficients(named, side, fisheye is True) if stated is None else (flat(stated) or [])
     key = named.key("lens", side) if stated is not None else "the coefficients k1, k2, p1, p2"
     if isinstance(fisheye, str):
-        return _realsense(fisheye, named_camera(name, core, size, "pinhole"), numbers(lens, 5, key), notes)
+        return _realsense_lens(fisheye, named_camera(name, core, size, "pinhole"), numbers(lens, 5, key), notes)
     if fisheye and len(lens) > 4 and not any(lens[4:]):
         lens = lens[:4]
     if named.get("xi", side) is not None:
@@ -314,7 +314,7 @@ def _camera(named: _Named, side: str, name: str, hints: Hints, notes: list[str])
     return camera if hints.size else _delivered(named, side, camera, notes)
 
 
-def _realsense(kind: str, like: Camera, lens: list[float], notes: list[str]) -> Camera:
+def _realsense_lens(kind: str, like: Camera, lens: list[float], notes: list[str]) -> Camera:
     """A lens of librealsense: its inverse one says where the ray of a distorted point is, as its documentation says."""
     name = camera_name(like, "camera")
     if kind != "inverse":
