@@ -204,6 +204,11 @@ IMAGES = Wanted(
 VIDEO = dataclasses.replace(
     IMAGES, words="a video", kinds=frozenset({"video", "device", "unknown", "foreign"}), make="kcal live --help"
 )
+VIEWED = dataclasses.replace(
+    OBSERVATIONS,
+    words="marks, positions, landmarks, observations or an image",
+    kinds=MARKS.kinds | SURVEY.kinds | {"observations", "image"},
+)
 FOREIGN = Wanted(
     "a file of another program",
     frozenset({"camera", "rig", "foreign", "json", "image", "unknown", "table", "survey", "marks", "geojson", "gpx"}),

@@ -35,6 +35,7 @@ from kcal.cli.settings import defaults_of, read_settings
 from kcal.cli.show import show_command
 from kcal.cli.sites import budget_command, sites_command
 from kcal.cli.stars import stars_command
+from kcal.cli.view import view_command
 from kcal.cli.watch import watch_command
 from kcal.errors import KcalError
 from kcal.files import written_files
@@ -117,7 +118,8 @@ COMMANDS = (
     demo_command, init_command, capture_command, detect_command, calibrate_command, interpolate_command,
     compare_command, batch_command, mark_command, station_command, place_command, stars_command, locate_command,
     live_command, watch_command, budget_command, sites_command, rectify_command, rays_command, bake_command,
-    export_command, import_command, schema_command, show_command, diff_command, check_command, report_command,
+    export_command, import_command, schema_command, show_command, view_command, diff_command, check_command,
+    report_command,
 )  # fmt: skip
 # They run on, or write where they are told.
 WITHOUT_JSON = (capture_command, mark_command, live_command, watch_command)

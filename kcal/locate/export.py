@@ -17,9 +17,12 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 import orjson
+import torch
 
-from kcal.errors import InputError, with_extra
+from kcal.errors import FileError, InputError, with_extra
 from kcal.files import open_atomic
+from kcal.locate.geodesy import geodetic_to_enu
+from kcal.locate.points import PointLocator
 from kcal.locate.positions import (
     CORNER_DECIMALS,
     NOWHERE,
@@ -31,7 +34,7 @@ from kcal.locate.positions import (
     position_table,
     ring_blocks,
 )
-from kcal.locate.tables import NUMBERS, TEXTS, PositionColumns, guarded, is_number, number_lines
+from kcal.locate.tables import NUMBERS, TEXTS, PositionColumns, guarded, header_of, is_number, number_lines, read_chunks
 from kcal.texts import csv_line, one_line, visible
 
 # Positions as KML 2.2 (OGC 07-147r2), for Google Earth and every GIS: points, 95 % regions, cameras.
@@ -574,3 +577,53 @@ def write_positions(path: str | Path, located: Located) -> Path:
         writer.add(located.columns)
         writer.close()
     return Path(path)
+
+
+# Read positions back.
+
+_CODES = {name: code for code, name in STATUS_NAMES.items()}
+# Meters by which places and their latitudes may differ: files have all digits.
+_ROUNDED = 1e-3
+
+
+def read_positions(path: str | Path, locate: PointLocator) -> Located:
+    """Read the positions of a CSV file that kcal has written, of points or of tracks.
+
+    Args:
+        path: of the file.
+        locate: of the rig by which they were located.
+
+    Raises:
+        FileError: another table, a cell that cannot be read, or positions of another rig as far as that shows: another
+            frame, another place on the Earth, other cameras.
+    """
+    run = locate.located()
+    names = list(NUMBERS if run.origin else OWN_FRAME.values())
+    known = [*TEXTS, *([] if run.origin else ["frame"]), *names]
+    if ("frame" in header_of(path)) == bool(run.origin):
+        raise FileError(f"{path}: positions of another rig: those of this one are meters, {run.frame}")
+    parts = []
+    for chunk in read_chunks(path, ",".join(known), known, known, extras=True, unique=False):
+        cells = dict(chunk.columns)
+        numbers = np.full((len(chunk.names), len(NUMBERS)), np.nan)
+        try:
+            status = np.array([_CODES[text] for text in cells["status"]], np.int8)
+            for name in names:
+                place = names.index(name) if run.origin else _OWN_COLUMNS[names.index(name)]
+                numbers[:, place] = [float(cell or "nan") for cell in cells[name]]
+        except (KeyError, ValueError) as error:
+            raise FileError(f"{path}: lines {chunk.lines[0]} to {chunk.lines[-1]}: {error} is none of kcal") from error
+        extras = {name: texts for name, texts in cells.items() if name not in known}
+        parts.append(PositionColumns(chunk.names, status, cells["reason"], numbers, extras))
+    columns = PositionColumns.joined(parts)
+    there = torch.from_numpy(columns.numbers[columns.located])
+    if run.origin and bool(((geodetic_to_enu(there[:, :3], run.origin) - there[:, 4:7]).norm(dim=-1) > _ROUNDED).any()):
+        raise FileError(f"{path}: positions of another rig: this one counts from {run.origin}")
+    if run.feet is None:
+        return locate.located(columns)
+    cameras = columns.extras.get("told_from", columns.extras.get("cameras", [""] * len(columns.names)))
+    anchors = [text.split(" ")[0] for text in cameras]
+    rig = locate.localize.rig
+    if other := next((name for name in anchors if name and name not in rig.names), None):
+        raise FileError(f"{path}: positions of another rig: this one has no camera {other!r}")
+    return locate.located(columns, rig.center.cpu()[[rig.names.index(name) if name else 0 for name in anchors]])

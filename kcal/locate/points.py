@@ -218,15 +218,21 @@ def own_axes(rig: Rig) -> Tensor:
     return torch.stack([ecef_from_enu_rotation(lat, lon).T @ base for lat, lon, _ in geodetic])
 
 
+def camera_poses(localize: Localizer) -> tuple[Tensor, Tensor]:
+    """Centers (V, 3) of the cameras and their axes (V, 3, 3), columns, in the frame of the positions."""
+    center, axes = localize.rig.center.cpu(), localize.rig.rotation.mT.cpu()
+    if localize.weights == "all":
+        return center, axes
+    look = localize.enu_from_rig.cpu()
+    return center @ look.T, look @ axes
+
+
 def camera_views(localize: Localizer) -> tuple[Viewpoint, ...]:
     """Where the cameras of a rig stand and what they see, for maps; none where it has no place on the Earth."""
     origin, rig = localize.origin, localize.rig
     if origin is None:
         return ()
-    center, enu_from_cam = rig.center.cpu(), rig.rotation.mT.cpu()
-    if localize.weights == "marks":
-        look = localize.enu_from_rig.cpu()
-        center, enu_from_cam = center @ look.T, look @ enu_from_cam
+    center, enu_from_cam = camera_poses(localize)
     geodetic = enu_to_geodetic(center, origin).tolist()
     if localize.weights == "marks":
         geodetic[0] = origin.geodetic.tolist()

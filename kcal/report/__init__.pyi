@@ -12,3 +12,5 @@ from kcal.report.calibration import calibration_figure as calibration_figure
 from kcal.report.rig import rig_figure as rig_figure
 from kcal.report.positions import positions_figure as positions_figure
 from kcal.report.map_page import save_map as save_map
+from kcal.report.view import log_view as log_view
+from kcal.report.view import save_view as save_view
