@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import kcal
 from kcal.cli import inputs, kinds
-from kcal.cli.console import out, print_wrote
-from kcal.cli.inputs import pixel_sigma_of
+from kcal.cli.console import err, out, print_wrote
+from kcal.cli.inputs import pixel_sigma_and_source
 from kcal.cli.locate import LocateOptions, counts_text, pair_localizer
 from kcal.cli.options import Kind, Only
 from kcal.file_kind import file_kind
@@ -31,7 +31,7 @@ def view_command(
     output: kinds.NewFile,
     open_: bool = False,
     reach: Annotated[kinds.Distance, Kind(metavar="DISTANCE")] | None = None,
-    options: Annotated[LocateOptions, Only(("site", "heading"))],
+    options: Annotated[LocateOptions, Only(("site", "heading", "pixel_sigma"))],
 ) -> None:
     """Write a scene for the 3-D viewer rerun: cameras with the field of view of their lenses, and what they saw.
 
@@ -59,7 +59,7 @@ def view_command(
     from kcal.report.view import view_image
 
     solved = _rig_of(rig)
-    noise = pixel_sigma_of(None, solved)
+    noise, note = pixel_sigma_and_source(options.pixel_sigma, solved)
     pair = len(solved) == 2 and solved.in_first_frame and solved.root is None
     localize = pair_localizer(solved, options, noise)(solved) if pair else kcal.Localizer(solved, pixel_sigma=noise)
     shown: list[Any] = []
@@ -70,7 +70,7 @@ def view_command(
         elif kind == "observations":
             shown.append(kcal.Observations.load(file))
         else:
-            shown.append(_of_table(file, localize))
+            shown.append(_of_table(file, localize, note))
     kcal.report.save_view(output, localize, *shown, reach=reach)
     print_wrote(output)
     if open_:
@@ -92,7 +92,7 @@ def _rig_of(source: str) -> kcal.Rig:
     return kcal.Rig([camera], [name or path.name.split(".")[0]], torch.eye(3)[None], torch.zeros(1, 3))
 
 
-def _of_table(file: Path, localize: kcal.Localizer) -> Located | Survey:
+def _of_table(file: Path, localize: kcal.Localizer, note: str) -> Located | Survey:
     """Positions as they were written, marks as they are located now, or landmarks."""
     import torch
 
@@ -110,6 +110,8 @@ def _of_table(file: Path, localize: kcal.Localizer) -> Located | Survey:
     if "status" in columns:
         located = read_positions(file, locate)
     else:
+        if note:
+            err.print(note)
         names, single = localize.rig.names, localize.weights == "all" or is_long(file)
         locate = PointLocator(localize.weighing_all()) if single else locate
         parts, feet = zip(*(locate(marks) for marks, _ in read_mark_chunks(file, names, single=single)), strict=True)

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 Shown = Located | Survey | Observations | NDArray[np.uint8]
 
 # The field of view: points along each side of the image, and halvings on the way to where the lens ends.
-_SIDE, _HALVINGS = 32, 20
+_SIDE, _HALVINGS = 32, 12
 # Cells of the mesh that carries an image, along each side; and the most pixels of its texture's longer side.
 _CELLS, _TEXTURE = 32, 1024
 # The viewer has float32: the scene's zero is moved by whole multiples of this, meters, so that a digit is below 4 mm.
@@ -51,7 +51,7 @@ _CAMERAS = ((86, 156, 255), (255, 120, 100), (120, 220, 140), (230, 170, 255))
 _TARGETS, _LANDMARKS, _FAINT = (255, 190, 40), (90, 230, 120), (130, 130, 130)
 
 
-def field_of_view(camera: Camera) -> tuple[Tensor, Tensor]:
+def field_border(camera: Camera) -> tuple[Tensor, Tensor]:
     """Rays along the border of what a camera sees: through the image's edge, or where its lens ends inside the image.
 
     Returns:
@@ -60,7 +60,7 @@ def field_of_view(camera: Camera) -> tuple[Tensor, Tensor]:
 
     Example:
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
-        >>> rays, whole = field_of_view(camera)
+        >>> rays, whole = field_border(camera)
         >>> (rays[0] / rays[0, 2]).tolist(), bool(whole.all())
         ([-0.6, -0.3375, 1.0], True)
     """
@@ -116,10 +116,9 @@ def save_view(path: str | Path, rig: Rig | Localizer, *shown: Shown, reach: floa
     recording = rr.RecordingStream("kcal", recording_id=Path(path).stem, send_properties=False)
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
-    data = rr.binary_stream(recording)
     scene = _logged(rr, recording, rig, shown, reach)
     recording.send_blueprint(scene.blueprint())
-    return write_atomic(path, data.read() or b"")
+    return write_atomic(path, rr.binary_stream(recording).read() or b"")
 
 
 def log_view(recording: rerun.RecordingStream, rig: Rig | Localizer, *shown: Shown, reach: float | None = None) -> None:
@@ -151,8 +150,8 @@ def log_view(recording: rerun.RecordingStream, rig: Rig | Localizer, *shown: Sho
     _logged(rr, recording, rig, shown, reach)
 
 
-def _logged(rr: Any, recording: Any, rig: Rig | Localizer, shown: Sequence[Shown], reach: float | None) -> _Scene:
-    scene = _Scene(rr, recording, rig if isinstance(rig, Localizer) else Localizer(rig))
+def _logged(rr: Any, recording: Any, rig: Rig | Localizer, shown: Sequence[Shown], reach: float | None) -> _Recorded:
+    scene = _Recorded(rr, recording, rig if isinstance(rig, Localizer) else Localizer(rig))
     seen = [one for one in shown if isinstance(one, Observations)]
     images = [one for one in shown if isinstance(one, np.ndarray)]
     for what, given in (("observations", seen), ("images", images)):
@@ -171,7 +170,7 @@ def _logged(rr: Any, recording: Any, rig: Rig | Localizer, shown: Sequence[Shown
     return scene
 
 
-class _Scene:
+class _Recorded:
     """Where things go in a recording, and how far they reach."""
 
     def __init__(self, rr: Any, recording: Any, localize: Localizer) -> None:
@@ -203,7 +202,7 @@ class _Scene:
         turn = Rotation.from_matrix(self.turn[camera]).as_quat()
         pose = rr.Transform3D(translation=self.center[camera], quaternion=turn)
         self.recording.log(path, pose, rr.ViewCoordinates.RDF, static=True)
-        edge = self.reach * field_of_view(self.cameras[camera])[0].numpy()
+        edge = self.reach * field_border(self.cameras[camera])[0].numpy()
         strips = [np.concatenate([edge, edge[:1]]), *(np.stack([0 * ray, ray]) for ray in edge[::_SIDE])]
         lines = rr.LineStrips3D(strips, colors=color, radii=self.dots(0.8))
         self.recording.log([*path, "field of view"], lines, static=True)
@@ -274,10 +273,10 @@ class _Scene:
         labels = [f"{one.name} {interval_text(one, unit)} {unit.name}" for one in positions]
         self.places = np.concatenate([self.places, places])
         rr, at = self.rr, (times, lengths)
-        color = {"colors": [_TARGETS]}
+        color, regions = {"colors": [_TARGETS]}, {"centers": places, "half_sizes": half, "quaternions": turn}
         style = color | {"fill_mode": rr.components.FillMode.MajorWireframe, "line_radii": self.dots(0.8)}
-        self.put(["targets", "95 %"], rr.Ellipsoids3D, style, *at, centers=places, half_sizes=half, quaternions=turn)
-        self.put(["targets", "interval"], rr.LineStrips3D, color | {"radii": self.dots(1.5)}, *at, strips=lines)
+        self.put(["targets", "ellipsoids"], rr.Ellipsoids3D, style, *at, **regions)
+        self.put(["targets", "intervals"], rr.LineStrips3D, color | {"radii": self.dots(1.5)}, *at, strips=lines)
         self.put(["targets"], rr.Points3D, color | {"radii": self.dots(4)}, *at, positions=places, labels=labels)
         if times is not None:
             past = rr.Points3D(places, colors=_FAINT, radii=self.dots(1.5))
@@ -321,7 +320,7 @@ class _Scene:
                 there = torch.tensor([pixel is not None for pixel in one.views[view].pixels])
                 text = f"{name}: {float(rms[view]):.3f} px"
                 color = _CAMERAS[camera % len(_CAMERAS)]
-                strips = [corners[[*line, line[0]]].numpy() for line in [_around(one.board.points)]]
+                strips = [corners[[*line, line[0]]].numpy() for line in [_outermost(one.board.points)]]
                 log([*path, "board"], rr.LineStrips3D(strips, colors=color, radii=self.dots(1.5), labels=text))
                 log([*path, "board", "corners"], rr.Points3D(corners[there].numpy(), colors=color, radii=self.dots(2)))
         if names:
@@ -348,7 +347,7 @@ class _Scene:
         )  # fmt: skip
 
 
-def _around(points: Tensor) -> list[int]:
+def _outermost(points: Tensor) -> list[int]:
     """The corners that are farthest toward the four corners of a board, in turn."""
     x, y = points[:, 0], points[:, 1]
     return [int(value.argmax()) for value in (-x - y, x - y, x + y, y - x)]
