@@ -78,9 +78,7 @@ def test_stations_landmarks_and_images(command: Command) -> None:
     rig.root = rig.with_errors(attitude_deg=0.01)
     save_rig(rig, "stations.json")
     target = tensor([100.0, 5000.0, 100.0])
-    rows = [
-        f"ship,{name},{u!r},{v!r}" for name, (u, v) in zip(rig.names, rig(target[None])[0][0].tolist(), strict=True)
-    ]
+    rows = [f"ship,{name},{u!r},{v!r}" for name, (u, v) in zip(rig.names, rig(target)[0][0].tolist(), strict=True)]
     Path("sightings.csv").write_text("\n".join(["name,camera,u,v", *rows]) + "\n")
     Path("survey.csv").write_text("name,east,north,up,sigma\nspire,100,3000,50,0.1\n")
     for name in rig.names:
