@@ -62,8 +62,8 @@ PUBLIC = {
         TrackOptions Tracker group_objects matched_pixels pair_objects
     """,
     "kcal.report": """
-        Requirement calibration_figure camera_verdict positions_figure rig_figure rig_verdict save_map
-        save_picture
+        Requirement calibration_figure camera_verdict log_view positions_figure rig_figure rig_verdict save_map
+        save_picture save_view
     """,
     "kcal.stars": """
         Air SkyView StarCatalog calibrate_by_stars detect_stars name_stars star_source

@@ -333,14 +333,12 @@ class _Recorded:
         return float(shown or np.linalg.norm(self.center - middle, axis=-1).max() or 1.0)
 
     def blueprint(self) -> Any:
-        """One view from behind and above the cameras, in the direction in which they look."""
+        """One view from above the cameras and from their side, from which ellipsoids show how long they are."""
         show = self.rr.blueprint
         up = np.array([0, 0, 1.0]) if self.level else np.array([0, -1.0, 0])
         forward, middle = self.turn[:, :, 2].mean(0), self.center.mean(0)
-        ahead = self.places.mean(0) if len(self.places) else middle + 0.5 * self.reach * forward
-        eye = show.EyeControls3D(
-            position=middle + self.reach * (0.25 * up - 0.35 * forward), look_target=ahead, eye_up=up
-        )
+        aside, ahead = 0.5 * up - 0.25 * forward + 0.4 * np.cross(forward, up), 0.5 * self.reach * forward
+        eye = show.EyeControls3D(position=middle + self.reach * aside, look_target=middle + ahead, eye_up=up)
         return show.Blueprint(
             show.Spatial3DView(origin="/", name="kcal", eye_controls=eye), show.BlueprintPanel(state="collapsed"),
             show.SelectionPanel(state="collapsed"), show.TimePanel(state="collapsed"),
