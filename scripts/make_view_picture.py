@@ -2,8 +2,8 @@
 
     python -m scripts.make_view_picture [FOLDER]
 
-Everything is made by commands of kcal, marks by the site's truth with 0.1 px of noise. The viewer draws in software, on a
-display that is not there: `apt-get install xvfb mesa-vulkan-drivers`. With a folder, what is in it already is kept.
+Everything is made by commands of kcal, marks by the site's truth with 0.1 px of noise. The viewer draws in software, on
+a display that is not there: `apt-get install xvfb mesa-vulkan-drivers`. With a folder, what is in it already is kept.
 """
 
 from __future__ import annotations
@@ -22,36 +22,35 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parent.parent
 SIGMA = 0.1
 # Of the picture; and the bars of the window above and below the scene, which are cut off, at 2 pixels a point.
-WIDTH, HEIGHT = 1100, 700
+WIDTH, HEIGHT = 1000, 680
 ABOVE, BELOW = 124, 60
 
 
-def kcal(folder: Path, *words: str) -> None:
+def kcal(folder: Path, words: str) -> None:
     """Run one command of kcal in a folder; stop if it fails."""
-    subprocess.run([sys.executable, "-m", "kcal", *words], check=True, cwd=folder)
+    subprocess.run([sys.executable, "-m", "kcal", *words.split()], check=True, cwd=folder)
 
 
 def solve(folder: Path) -> None:
     """Calibrate both cameras and solve the rig, with what of it is not there yet."""
     if not (folder / ".truth").exists():
-        kcal(folder.parent, "demo", "--practice", folder.name)
+        kcal(folder.parent, f"demo --practice {folder.name}")
     truth = json.loads((folder / ".truth" / "truth.json").read_text())
     random, head = np.random.default_rng(0), "name,left_u,left_v,right_u,right_v"
     tables: dict[str, list[str]] = {"marks.csv": [head], "points.csv": [head]}
     for name, pixels in truth["marks"].items():
         seen = np.array(pixels).reshape(4) + SIGMA * random.standard_normal(4)
-        tables["points.csv" if name in truth["targets"] else "marks.csv"].append(
-            f"{name},{','.join(map(repr, seen.tolist()))}"
-        )
+        table = tables["points.csv" if name in truth["targets"] else "marks.csv"]
+        table.append(f"{name},{','.join(map(repr, seen.tolist()))}")
     for name, lines in tables.items():
         (folder / name).write_text("\n".join(lines) + "\n")
     for side in ("left", "right"):
         if not (folder / f"{side}.camera.json").exists():
-            kcal(folder, "detect", f"boards/{side}", *"--board 9x6 --square 60mm -o".split(), f"{side}.obs.json")
-            kcal(folder, "calibrate", f"{side}.obs.json", "-o", f"{side}.camera.json")
+            kcal(folder, f"detect boards/{side} --board 9x6 --square 60mm -o {side}.obs.json")
+            kcal(folder, f"calibrate {side}.obs.json -o {side}.camera.json")
     if not (folder / "rig.json").exists():
-        kcal(folder, *"rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv".split(),
-             "--pixel-sigma", str(SIGMA), "-o", "rig.json")  # fmt: skip
+        files = "left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv"
+        kcal(folder, f"rig {files} --pixel-sigma {SIGMA} -o rig.json")
 
 
 def screenshot(recording: Path, picture: Path) -> None:
@@ -59,14 +58,15 @@ def screenshot(recording: Path, picture: Path) -> None:
     shot = recording.with_suffix(".png")
     # The mouse is in the middle of the display: the window is beside it.
     display = ["xvfb-run", "-a", "-s", f"-screen 0 {3 * WIDTH}x{3 * HEIGHT}x24"]
-    viewer = [sys.executable, "-m", "rerun_cli", str(recording), *"--port auto --bind 127.0.0.1 --screenshot-to".split(),
-              str(shot), "--window-size", f"{WIDTH}x{HEIGHT}"]  # fmt: skip
+    where = f"--port auto --bind 127.0.0.1 --window-size {WIDTH}x{HEIGHT} --screenshot-to".split()
+    viewer = [sys.executable, "-m", "rerun_cli", str(recording), *where, str(shot)]
     home = str(recording.parent)
     subprocess.run(display + viewer, check=True, timeout=300, env=os.environ | {"CI": "1", "HOME": home})
     with Image.open(shot) as image:
         scene = image.convert("RGB").crop((0, ABOVE, image.width, image.height - BELOW))
     scene = scene.resize((WIDTH, round(scene.height * WIDTH / scene.width)), Image.Resampling.LANCZOS)
-    scene.quantize(128).save(picture, optimize=True)
+    # Median cut would lose the few pixels of the lines.
+    scene.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(picture, optimize=True)
 
 
 def main() -> None:
@@ -76,7 +76,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = (given or Path(temporary, "site")).resolve()
         solve(folder)
-        kcal(folder, *"view rig.json points.csv survey.csv site/left.png site/right.png -o view.rrd".split())
+        kcal(folder, "view rig.json points.csv site/left.png site/right.png -o view.rrd")
         screenshot(folder / "view.rrd", ROOT / "assets" / "view.png")
 
 

@@ -207,7 +207,7 @@ VIDEO = dataclasses.replace(
 VIEWED = dataclasses.replace(
     OBSERVATIONS,
     words="marks, positions, landmarks, observations or an image",
-    kinds=MARKS.kinds | SURVEY.kinds | {"observations", "image"},
+    kinds=MARKS.kinds | {"survey", "observations", "image"},
 )
 FOREIGN = Wanted(
     "a file of another program",

@@ -145,7 +145,7 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[PointLocato
     stated = own.height is not None or own.terrain is not None
     many = stated or is_long(points) or len(solved) != 2 or not solved.in_first_frame
     if many:
-        _refuse_of_pairs(own)
+        refuse_of_pairs(own)
     elif own.aged is not None and own.history is not None:
         raise typer.BadParameter("--aged guesses what --history tells: give either")
     noise, note = pixel_sigma_and_source(own.pixel_sigma, solved)
@@ -178,7 +178,8 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[PointLocato
     return locate, parts(), note
 
 
-def _refuse_of_pairs(own: LocateOptions) -> None:
+def refuse_of_pairs(own: LocateOptions) -> None:
+    """Refuse options of two cameras, whose rig's file does not say where they stand, for any other rig."""
     elsewhere = own.site or own.heading or own.yaw_sigma or own.refraction or own.aged or own.history
     if elsewhere and not {"site", "heading"} & taken:
         raise typer.BadParameter(

@@ -12,7 +12,7 @@ import kcal
 from kcal.cli import inputs, kinds
 from kcal.cli.console import err, out, print_wrote
 from kcal.cli.inputs import pixel_sigma_and_source
-from kcal.cli.locate import LocateOptions, counts_text, pair_localizer
+from kcal.cli.locate import LocateOptions, counts_text, pair_localizer, refuse_of_pairs
 from kcal.cli.options import Kind, Only
 from kcal.file_kind import file_kind
 
@@ -55,18 +55,19 @@ def view_command(
         open_: Open it in the viewer, which then sends no statistics.
         reach: How far rays and images are drawn; as far as the farthest thing that is shown if not given.
     """
-    from kcal.files import read_bytes
     from kcal.report.view import view_image
 
     solved = _rig_of(rig)
     noise, note = pixel_sigma_and_source(options.pixel_sigma, solved)
     pair = len(solved) == 2 and solved.in_first_frame and solved.root is None
+    if not pair:
+        refuse_of_pairs(options)
     localize = pair_localizer(solved, options, noise)(solved) if pair else kcal.Localizer(solved, pixel_sigma=noise)
     shown: list[Any] = []
     for file in files or []:
         kind = file_kind(file)
         if kind == "image":
-            shown.append(view_image(read_bytes(file), file))
+            shown.append(view_image(file))
         elif kind == "observations":
             shown.append(kcal.Observations.load(file))
         else:
@@ -103,19 +104,18 @@ def _of_table(file: Path, localize: kcal.Localizer, note: str) -> Located | Surv
     from kcal.locate.survey import read_survey
     from kcal.locate.tables import PositionColumns, header_of
 
-    columns = header_of(file)
-    if file_kind(file) != "marks" and "status" not in columns:
-        return read_survey(file, localize.origin, measured=False)
     locate = PointLocator(localize)
-    if "status" in columns:
+    if "status" in header_of(file):
         located = read_positions(file, locate)
+    elif file_kind(file) == "survey":
+        return read_survey(file, localize.origin, measured=False)
     else:
-        if note:
-            err.print(note)
         names, single = localize.rig.names, localize.weights == "all" or is_long(file)
         locate = PointLocator(localize.weighing_all()) if single else locate
         parts, feet = zip(*(locate(marks) for marks, _ in read_mark_chunks(file, names, single=single)), strict=True)
         located = locate.located(PositionColumns.joined(parts), torch.cat(feet) if single else None)
+        if note:
+            err.print(note)
     codes = located.columns.status.tolist()
     counts = {name: codes.count(code) for code, name in STATUS_NAMES.items() if code in codes}
     out.print(f"{file}: {counts_text(len(codes), counts)}")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.pairs import pose_alone
 from kcal.corners.images import decode_image, to_8bit
-from kcal.corners.observations import Observations, View
+from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError, with_extra
 from kcal.files import read_bytes, write_atomic
 from kcal.lens.camera import Camera
@@ -31,9 +32,6 @@ from kcal.locate.tables import NUMBERS
 from kcal.report.tables import interval_text, range_unit
 from kcal.solve.lm import LMOptions
 from kcal.texts import unix_seconds
-
-if TYPE_CHECKING:
-    import rerun
 
 Shown = Located | Survey | Observations | NDArray[np.uint8]
 
@@ -121,7 +119,7 @@ def save_view(path: str | Path, rig: Rig | Localizer, *shown: Shown, reach: floa
     return write_atomic(path, rr.binary_stream(recording).read() or b"")
 
 
-def log_view(recording: rerun.RecordingStream, rig: Rig | Localizer, *shown: Shown, reach: float | None = None) -> None:
+def log_view(recording: Any, rig: Rig | Localizer, *shown: Shown, reach: float | None = None) -> None:
     """Log a rig to a recording of rerun, and what it saw; a viewer that is connected shows it at once.
 
     The scene is east, north, up of the origin of a rig that has a place on the Earth, and the rig's own frame otherwise
@@ -311,20 +309,24 @@ class _Recorded:
             for camera, (one, (poses, rms)) in enumerate(zip(seen, boards, strict=True)):
                 path = ["cameras", self.names[camera]]
                 view = one.names.index(name) if name in one.names else None
-                image = None if view is None else _image_of(one.views[view])
-                log([*path, "image"], rr.Clear(recursive=False) if image is None else self.mesh(camera, image))
+                log([*path, "image"], rr.Clear(recursive=False))
+                log([*path, "board"], rr.Clear(recursive=True))
+                # Images that are no longer there, or no longer the same, are not shown.
+                with suppress(FileError):
+                    if view is not None and one.views[view].image:
+                        image = view_image(one.views[view].image or "", one.views[view].sha256)
+                        log([*path, "image"], self.mesh(camera, image))
                 if view is None or not bool(rms[view].isfinite()):
-                    log([*path, "board"], rr.Clear(recursive=True))
                     continue
-                corners = one.board.points @ poses.rotation[view].T + poses.translation[view]
-                there = torch.tensor([pixel is not None for pixel in one.views[view].pixels])
-                text = f"{name}: {float(rms[view]):.3f} px"
-                color = _CAMERAS[camera % len(_CAMERAS)]
-                strips = [corners[[*line, line[0]]].numpy() for line in [_outermost(one.board.points)]]
-                log([*path, "board"], rr.LineStrips3D(strips, colors=color, radii=self.dots(1.5), labels=text))
-                log([*path, "board", "corners"], rr.Points3D(corners[there].numpy(), colors=color, radii=self.dots(2)))
-        if names:
-            self.recording.disable_timeline("view")
+                corners = (one.board.points @ poses.rotation[view].T + poses.translation[view]).numpy()
+                there = [pixel is not None for pixel in one.views[view].pixels]
+                color, text = _CAMERAS[camera % len(_CAMERAS)], f"{name}: {float(rms[view]):.3f} px"
+                # Through the corners that are outermost toward each corner of the board.
+                x, y = one.board.points[:, 0], one.board.points[:, 1]
+                around = [corners[int(value.argmax())] for value in (-x - y, x - y, x + y, y - x, -x - y)]
+                log([*path, "board"], rr.LineStrips3D([around], colors=color, radii=self.dots(1.5), labels=text))
+                log([*path, "board", "corners"], rr.Points3D(corners[there], colors=color, radii=self.dots(2)))
+        self.recording.disable_timeline("view")
 
     def extent(self) -> float:
         """How far the farthest thing that is shown is from the cameras, meters; of cameras alone, from each other."""
@@ -345,26 +347,14 @@ class _Recorded:
         )  # fmt: skip
 
 
-def _outermost(points: Tensor) -> list[int]:
-    """The corners that are farthest toward the four corners of a board, in turn."""
-    x, y = points[:, 0], points[:, 1]
-    return [int(value.argmax()) for value in (-x - y, x - y, x + y, y - x)]
-
-
-def _image_of(view: View) -> NDArray[np.uint8] | None:
-    """The image of a view, if it is still where it was, and as it was."""
-    try:
-        data = read_bytes(view.image or "")
-        return view_image(data, view.image or "") if view.sha256 in (None, hashlib.sha256(data).hexdigest()) else None
-    except FileError:
-        return None
-
-
-def view_image(data: bytes, source: str | Path) -> NDArray[np.uint8]:
-    """An image as it is shown, (H, W) or (H, W, 3), of the bytes of a file.
+def view_image(path: str | Path, sha256: str | None = None) -> NDArray[np.uint8]:
+    """An image file as it is shown, (H, W) or (H, W, 3).
 
     Raises:
-        FileError: no image that can be read.
+        FileError: no image that can be read, or another one than that of the digest.
     """
-    image = to_8bit(decode_image(data, source))
+    data = read_bytes(path)
+    if sha256 not in (None, hashlib.sha256(data).hexdigest()):
+        raise FileError(f"{path}: the image has changed since its corners were found")
+    image = to_8bit(decode_image(data, path))
     return image[..., :3] if image.ndim == 3 else image
