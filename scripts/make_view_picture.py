@@ -21,8 +21,10 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parent.parent
 SIGMA = 0.1
-# Of the picture; and the bars of the window above and below the scene, which are cut off, at 2 pixels a point.
-WIDTH, HEIGHT = 1000, 680
+# Of the window, points; and its bars above and below the scene, which are cut off, at 2 pixels a point.
+WIDTH, HEIGHT = 860, 600
+# Pixels a point of the picture.
+SCALE = 1.5
 ABOVE, BELOW = 124, 60
 
 
@@ -64,7 +66,7 @@ def screenshot(recording: Path, picture: Path) -> None:
     subprocess.run(display + viewer, check=True, timeout=300, env=os.environ | {"CI": "1", "HOME": home})
     with Image.open(shot) as image:
         scene = image.convert("RGB").crop((0, ABOVE, image.width, image.height - BELOW))
-    scene = scene.resize((WIDTH, round(scene.height * WIDTH / scene.width)), Image.Resampling.LANCZOS)
+    scene = scene.resize((round(SCALE * WIDTH), round(SCALE * scene.height / 2)), Image.Resampling.LANCZOS)
     # Median cut would lose the few pixels of the lines.
     scene.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(picture, optimize=True)
 
