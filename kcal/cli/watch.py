@@ -40,6 +40,7 @@ def watch_command(
     limit: Annotated[float, Kind(metavar="DEG", least=1e-4)] = 0.005,
     alarm: Annotated[list[str], Kind(metavar="URL|exit")] | None = None,
     relock: Path | None = None,
+    parquet: Annotated[Path, Kind(metavar="PARQUET", writes=True)] | None = None,
     picture: kinds.Picture | None = None,
 ) -> None:
     """Watch how the cameras of a rig turn, from what they see, and keep a history with the sigma of every moment.
@@ -73,11 +74,12 @@ def watch_command(
         limit: Relative turn beyond which there is an alarm.
         alarm: Where an alarm is sent as JSON (POST); exit: end then. May be repeated.
         relock: Rig file to write at the end, if the history proves the old one wrong; an old one of that name is kept.
+        parquet: The history as a Parquet file, too: written whole once a day and at the end, for tools of tables.
         picture: The attitude over time and its 95 % intervals, at the end.
     """
     from kcal.corners.images import read_gray
     from kcal.io.rig_file import load_pair
-    from kcal.watch.history import Temperatures
+    from kcal.watch.history import Temperatures, save_history
     from kcal.watch.watcher import Watcher, Webhook
     from kcal.watch.watcher import relock as relocked_by
 
@@ -85,6 +87,11 @@ def watch_command(
         raise typer.BadParameter("two folders, videos or addresses, of the left and the right camera, are needed")
     if output.suffix.lower() != ".csv":
         raise typer.BadParameter(f"--output {output}: a name that ends with .csv is needed")
+    if parquet is not None:
+        if parquet.suffix.lower() != ".parquet":
+            raise typer.BadParameter(f"--parquet {parquet}: a name that ends with .parquet is needed")
+        with with_extra("tables", "Parquet files need"):
+            pass
     if relock is not None:
         check_writable(relock, output)
     hooks = [Webhook(address) for address in alarm or [] if address != _EXIT]
@@ -93,7 +100,7 @@ def watch_command(
     if images:
         air = None if temperatures is None else Temperatures(temperatures)
         watcher = Watcher(
-            known, output, every_s=every, limit_deg=limit, temperatures=air,
+            known, output, every_s=every, limit_deg=limit, temperatures=air, parquet=parquet,
             tell=lambda text: err.print(text),
         )  # fmt: skip
         try:
@@ -108,6 +115,8 @@ def watch_command(
         err.print(_summary(watcher, hooks))
         if not watcher.last_time > -math.inf:
             raise InputError("no pair of images was looked at")
+    if parquet is not None:
+        print_wrote(save_history(output, parquet))
     with steps("fitting how it turns", None):
         watched = kcal.rig.Watched.read(output, known)
     _tell_turns(watched, limit)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from kcal.arrow import arrow_table
 from kcal.locate.geodesy import place_enu
 from kcal.locate.localizer import Localizer
 from kcal.locate.stereo import BEARING_SIGMAS, PositionStatus, flag_positions, range_interval, status_counts
@@ -56,6 +57,30 @@ class TrackStates(NamedTuple):
 
     def __repr__(self) -> str:
         return brief(self, status=status_counts(self.status))
+
+
+def track_table(
+    state: TrackStates, number: Sequence[int], time: Tensor, texts: dict[str, list[str]], more: dict[str, Tensor]
+) -> Any:
+    """Places and velocities of tracks of these numbers as a `pyarrow.Table`; null where the status is not OK."""
+    ok = (state.status == int(PositionStatus.OK))[:, None]
+    upper = [[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    blocks = {
+        "lat lon height_ellipsoidal_m": state.geodetic,
+        "east_m north_m up_m": state.enu,
+        "range_m": state.inverse_range.reciprocal()[:, None],
+        "cov_ee_m2 cov_en_m2 cov_eu_m2 cov_nn_m2 cov_nu_m2 cov_uu_m2": state.covariance[:, upper[0], upper[1]],
+        "velocity_east_mps velocity_north_mps velocity_up_mps": state.velocity,
+        "velocity_east_sigma_mps velocity_north_sigma_mps velocity_up_sigma_mps": (
+            state.velocity_covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
+        ),
+    }
+    numbers = {"time_s": time, **more, "range_low_m": state.range_low, "range_high_m": state.range_high}
+    for names, values in blocks.items():
+        numbers |= dict(zip(names.split(), torch.where(ok, values, torch.nan).T, strict=True))
+    status = [PositionStatus(code).name.lower() for code in state.status.tolist()]
+    columns: dict[str, Any] = {"name": [f"track {one}" for one in number], "status": status, **texts}
+    return arrow_table(columns | {name: values.cpu().numpy() for name, values in numbers.items()})
 
 
 def track_states(
@@ -137,6 +162,10 @@ class SmoothedTrack(NamedTuple):
     number: int
     time: Tensor
     state: TrackStates
+
+    def to_arrow(self) -> Any:
+        """A `pyarrow.Table`, a row for each time, with the columns of the files of tracks; needs the extra `tables`."""
+        return track_table(self.state, [self.number] * len(self.time), self.time, {}, {})
 
 
 class _Moment(NamedTuple):

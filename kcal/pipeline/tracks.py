@@ -20,7 +20,7 @@ from kcal.lens.pose import side_axes
 from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import MOUNTING_ERRORS
 from kcal.pipeline.assignment import Candidates, Looks, Scores, SeenFrom, assigned, looks_of, nearby, within
-from kcal.pipeline.estimates import History, SmoothedTrack, TrackStates, track_states
+from kcal.pipeline.estimates import History, SmoothedTrack, TrackStates, track_states, track_table
 from kcal.pipeline.measurements import (
     Anchored,
     ClockEstimate,
@@ -135,6 +135,15 @@ class Tracks(NamedTuple):
     state: TrackStates
     models: Tensor
     seen: Tensor
+
+    def to_arrow(self) -> Any:
+        """A `pyarrow.Table`, a row for each track, with the columns of the files of tracks; needs the extra `tables`.
+
+        Example:
+            >>> polars.concat(polars.DataFrame(tracker(views).to_arrow()) for views in moments)  # doctest: +SKIP
+        """
+        time, more = torch.full_like(self.unseen_s, self.time), {"hits": self.hits, "unseen_s": self.unseen_s}
+        return track_table(self.state, self.number, time, {"category": [*self.category]}, more)
 
 
 # What a tracker computes at each time step, as functions of tensors alone: as they are, or compiled.

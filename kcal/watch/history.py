@@ -5,11 +5,12 @@ from __future__ import annotations
 import bisect
 import csv
 import dataclasses
+import io
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.checks import chi2_quantile
-from kcal.errors import FileError, InputError
+from kcal.errors import FileError, InputError, with_extra
+from kcal.files import read_bytes, write_atomic
 from kcal.lens.rig import Rig
 from kcal.texts import csv_line, unix_seconds
 
@@ -351,7 +353,7 @@ def _jumped(after: TurnState, prior: TurnState) -> bool:
 
 
 class GrowingTable:
-    """Rows of a CSV file that another process writes, as they become whole.
+    """Rows of a CSV file that another process writes, as they become whole; or of a Parquet file, as it is now.
 
     Args:
         path: of the file.
@@ -374,6 +376,11 @@ class GrowingTable:
         Raises:
             FileError: the file cannot be read, has other columns, or a row with another number of cells.
         """
+        if Path(self.path).suffix.lower() == ".parquet":
+            for row in [] if self.number else _parquet_rows(self.path, self._needed, self._wanted):
+                self.number += 1
+                yield row
+            return
         try:
             with open(self.path, "rb") as file:
                 file.seek(self._offset)
@@ -396,6 +403,22 @@ class GrowingTable:
                         yield dict(zip(self._columns, cells, strict=True))
         except OSError as error:
             raise FileError(f"{self.path}: cannot read: {error.strerror or error}") from error
+
+
+def _parquet_rows(path: str | Path, needed: set[str], wanted: str) -> Iterator[dict[str, str]]:
+    with with_extra("tables", "Parquet histories need"):
+        import pyarrow
+        from pyarrow.parquet import ParquetFile
+
+    try:
+        with ParquetFile(path) as file:
+            if not needed <= set(file.schema_arrow.names):
+                raise FileError(f"{path}: {wanted}")
+            for batch in file.iter_batches(1000):
+                for row in batch.to_pylist():
+                    yield {name: "" if value is None else str(value) for name, value in row.items()}
+    except (OSError, pyarrow.ArrowInvalid) as error:
+        raise FileError(f"{path}: cannot read: {error}") from error
 
 
 # The history of a watched rig as a growing CSV file: what each measurement measured, and what it made of it.
@@ -421,6 +444,7 @@ _TELLS = torch.tensor([0] * 3 + [1] * 3 + [0] * 6 + [1] * 6 + [2] * 20)
 COLUMNS = (
     "time", "rig", *_TOLD, "left_features", "right_features", "matches", "lasting", "temperature_c", *_LOOK, "note",
 )  # fmt: skip
+_NO_HISTORY = "not a history of this version of `kcal watch`"
 # Rows that are kept of a file: two weeks of a measurement a minute.
 MOST_ROWS = 20_000
 
@@ -468,6 +492,44 @@ def history_line(row: HistoryRow, fingerprint: str, told: tuple[Tensor, Tensor])
     )
 
 
+def history_table(path: str | Path) -> Any:
+    """A history as far as its lines are whole, as a `pyarrow.Table`: the columns of the file, unknown numbers null.
+
+    Raises:
+        FileError: the file cannot be read, has other columns, or is damaged.
+        InputError: pyarrow is not installed, the extra `tables`.
+    """
+    with with_extra("tables", "Parquet histories need"):
+        import pyarrow
+        from pyarrow.csv import ConvertOptions, read_csv
+
+    data = read_bytes(path)
+    kinds = dict.fromkeys(COLUMNS, pyarrow.float64()) | dict.fromkeys(("rig", "note"), pyarrow.string())
+    kinds |= dict.fromkeys(("left_features", "right_features", "matches"), pyarrow.int64())
+    try:
+        table = read_csv(
+            pyarrow.py_buffer(data[: data.rfind(b"\n") + 1]), convert_options=ConvertOptions(column_types=kinds)
+        )
+    except pyarrow.ArrowInvalid as error:
+        raise FileError(f"{path}: no history of `kcal watch`, or a damaged one: {error}") from error
+    if not set(COLUMNS) <= set(table.column_names):
+        raise FileError(f"{path}: {_NO_HISTORY}")
+    return table
+
+
+def save_history(path: str | Path, parquet: str | Path) -> Path:
+    """Write a history as a Parquet file, whole or not at all; see `history_table`.
+
+    A Parquet file ends with the places of its rows, so that none can be added: what grows, and survives a power cut, is
+    the CSV file.
+    """
+    table, data = history_table(path), io.BytesIO()
+    from pyarrow.parquet import write_table
+
+    write_table(table, data)
+    return write_atomic(parquet, data.getvalue())
+
+
 def history_head() -> str:
     """The first line of the file."""
     return csv_line(COLUMNS)
@@ -477,12 +539,12 @@ class HistoryTail:
     """The rows of a history that grows, as far as they are whole.
 
     Args:
-        path: of the file.
+        path: of the CSV file, or of a Parquet file that `save_history` wrote.
         fingerprint: of the rig that was watched.
     """
 
     def __init__(self, path: str | Path, fingerprint: str) -> None:
-        self._table = GrowingTable(path, COLUMNS, "not a history of this version of `kcal watch`")
+        self._table = GrowingTable(path, COLUMNS, _NO_HISTORY)
         self._fingerprint, self._first, self._kelvin = fingerprint, math.nan, None
 
     _kelvin: Tensor | None

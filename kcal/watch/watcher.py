@@ -426,6 +426,7 @@ class Watcher:
         every_s: seconds between measurements.
         limit_deg: relative turn beyond which there is an alarm.
         temperatures: of the air at the rig, if they are known.
+        parquet: file to which the history is written whole once a day; see `kcal.watch.history.save_history`.
         tell: called with what happens.
 
     Raises:
@@ -440,12 +441,13 @@ class Watcher:
         every_s: float = 60.0,
         limit_deg: float = LIMIT,
         temperatures: past.Temperatures | None = None,
+        parquet: Path | None = None,
         tell: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.rig, self.every_s, self.limit_deg, self.tell = rig, every_s, limit_deg, tell
         self.history, self.reference = history, history.with_suffix(".reference.npz")
         self.skipped, self.looks, self.alarms = 0, 0, 0
-        self._temperatures, self._warmth = temperatures, math.nan
+        self._temperatures, self._warmth, self._parquet = temperatures, math.nan, parquet
         self._rows: deque[past.HistoryRow] = deque(maxlen=_KEPT_ROWS)
         self._sides: tuple[measure.FixedFeatures, measure.FixedFeatures] | None = None
         self._matched, self._learned, self._alarm = -math.inf, -math.inf, False
@@ -533,6 +535,8 @@ class Watcher:
             self._renew(left, right)
         if time - self._learned >= _LEARN_S:
             self.watched = self._relearned()
+            if self._parquet is not None:
+                past.save_history(self.history, self._parquet)
         if row.note != self._notes:
             self.tell(row.note or "both cameras see the reference again")
             self._notes = row.note

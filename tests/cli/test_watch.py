@@ -9,6 +9,7 @@ from pathlib import Path
 from socketserver import StreamRequestHandler, TCPServer
 
 import orjson
+import polars
 import pytest
 import torch
 from command_line import Command
@@ -16,6 +17,7 @@ from PIL import Image
 from typer.testing import CliRunner
 from waiting import PATIENCE
 
+import kcal.watch.watcher as watcher_module
 from kcal.cli.main import app
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.rig import Mounting, Origin
@@ -45,12 +47,13 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_drift_is_found_told_and_drawn(site: Path, command: Command) -> None:
     history, picture = site / "h.csv", site / "p.png"
     words = [str(site / name) for name in ("rig.json", "left", "right")]
-    found = command("watch", *words, "-o", history, "--picture", picture, code=3)
+    found = command("watch", *words, "-o", history, "--picture", picture, "--parquet", site / "h.parquet", code=3)
     assert "beyond the limit of 0.005°" in " ".join(found.err.split())
     assert picture.stat().st_size > 10_000
     with history.open() as file:
         rows = list(csv.DictReader(file))
     assert [float(row["time"]) for row in rows] == [START + 60.0 * k for k in range(5)]
+    assert polars.read_parquet(site / "h.parquet")["time"].to_list() == [float(row["time"]) for row in rows]
     assert float(rows[4]["relative_yaw_deg"]) == pytest.approx(0.02, abs=0.003)
     assert int(rows[0]["matches"]) > 100
     # Doubted at first: the interval contains both.
@@ -59,6 +62,18 @@ def test_a_drift_is_found_told_and_drawn(site: Path, command: Command) -> None:
     again = command("watch", *words, "-o", history, "--relock", site / "new.json")
     assert "not re-locked: a day of history is needed" in " ".join(again.out.split())
     assert not (site / "new.json").exists()
+
+
+@pytest.mark.slow
+def test_a_history_becomes_parquet_once_a_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, rows, seen = tmp_path / "h.parquet", [], pair(1)
+    monkeypatch.setattr(watcher_module, "_LEARN_S", 100.0)
+    watcher = watcher_module.Watcher(small_rig(), tmp_path / "h.csv", every_s=1.0, parquet=made)
+    for k in range(3):
+        watcher.look(60.0 * k, seen.left, seen.right)
+        rows.append(polars.read_parquet(made)["time"].to_list())
+    watcher.close()
+    assert rows == [[0.0], [0.0], [0.0, 60.0, 120.0]]
 
 
 @pytest.fixture
@@ -189,6 +204,7 @@ def test_a_webhook_that_speaks_no_http_ends_nothing() -> None:
         (["-o", "h.csv", "left"], "two folders"),
         (["-o", "h.json", "left", "right"], "ends with .csv"),
         (["-o", "h.csv", "--alarm", "mail:me"], "http"),
+        (["-o", "h.csv", "--parquet", "h.txt"], "ends with .parquet"),
     ],
 )
 def test_wrong_words(tmp_path: Path, words: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:

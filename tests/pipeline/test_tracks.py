@@ -5,15 +5,19 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import pandas
+import polars
 import pytest
 import torch
 from locate_rigs import real_rig, tensor
 from track_scenes import ORIGIN, pairs_of, seen_by, tracked_site, yawed_rig
 
 from kcal import InputError, Localizer
+from kcal.locate.tables import NUMBERS, TEXTS
 from kcal.pipeline.estimates import track_states
 from kcal.pipeline.imm_filter import Motion, Timing, born
 from kcal.pipeline.measurements import anchored, known_sightings, sightings
+from kcal.pipeline.stream import track_columns
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 from kcal.rig import RigCovariance
 
@@ -278,3 +282,32 @@ def test_time_must_be_given_and_must_not_go_back() -> None:
 def test_impossible_options(wrong: dict[str, object]) -> None:
     with pytest.raises(InputError):
         TrackOptions(**wrong)  # type: ignore[arg-type]
+
+
+def test_tracks_are_tables() -> None:
+    localize = tracked_site()
+    tracker = Tracker(localize, STEADY, record=True)
+    for time in range(4):
+        points = tensor([10.0 + time, -3.0, 120.0], [-15.0, 20.0, 900.0], [0.0, 40.0, 90_000.0])
+        left, right = localize.rig(points)[0].unbind(-2)
+        tracks = tracker(pairs_of(left, right, float(time)))
+    ours, theirs = polars.DataFrame(tracks.to_arrow()), pandas.DataFrame.from_arrow(tracks.to_arrow())
+    assert ours["name"].to_list() == list(theirs["name"]) == [f"track {number}" for number in tracks.number]
+    assert ours["hits"].to_list() == tracks.hits.tolist()
+    assert set(ours["time_s"]) == {3.0}
+    assert ours["status"].to_list() == ["ok", "ok", "bearing_only"]
+    state = tracks.state
+    for name, value in {
+        "north_m": state.enu[:, 1], "cov_eu_m2": state.covariance[:, 0, 2], "lon": state.geodetic[:, 1],
+        "velocity_up_mps": state.velocity[:, 2],
+    }.items():  # fmt: skip
+        assert ours[name].to_list() == [*value[:2].tolist(), None]
+    assert (ours["range_low_m"] < ours["range_m"]).to_list() == [True, True, None]
+    columns = track_columns(tracks, 1)
+    texts = {*TEXTS, *NUMBERS, *columns.extras}
+    assert set(ours.columns) <= texts
+    assert torch.tensor(ours["range_m"][:2]) == pytest.approx(columns.column("range_m")[:2], rel=1e-6)
+    smoothed = tracker.smoothed()[0]
+    table = pandas.DataFrame.from_arrow(smoothed.to_arrow())
+    assert list(table["time_s"]) == smoothed.time.tolist()
+    assert list(table["east_m"]) == smoothed.state.enu[:, 0].tolist()

@@ -9,6 +9,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pandas
+import polars
+import pyarrow.parquet
 import pytest
 import torch
 
@@ -16,6 +19,7 @@ from kcal import FileError, InputError, Origin
 from kcal.corners.images import image_time
 from kcal.rig import Mounting, planned_rig
 from kcal.watch.history import (
+    COLUMNS,
     AngleSeries,
     HistoryRow,
     HistoryTail,
@@ -27,6 +31,7 @@ from kcal.watch.history import (
     learned,
     passed,
     read_history,
+    save_history,
     taken,
     turns_of,
 )
@@ -61,6 +66,46 @@ def test_a_history_keeps_what_was_measured(tmp_path: Path) -> None:
     assert not back[1].look.seen.any()
     assert [float(row.look.kelvin) for row in back] == [0.0, 0.0, 1.5]
     assert [row.time for row in read_history(tmp_path / "h.csv", RIG.fingerprint, since=2.0, until=3.5)] == [3.0]
+
+
+def test_a_history_as_parquet_is_the_same(tmp_path: Path) -> None:
+    rows = [row_of(1.5, yaw_turn(0.01), note='fog, "perhaps"'), row_of(3.0, None), row_of(4.0, None, note="=1+1")]
+    path = write_history(tmp_path / "h.csv", [rows[0], rows[1]._replace(temperature=21.5), rows[2]])
+    with path.open("a") as file:
+        file.write("5.0,half a li")  # what a power cut leaves
+    made = save_history(path, tmp_path / "h.parquet")
+    table = pyarrow.parquet.read_table(made)
+    assert table.num_rows == 3
+    assert tuple(table.column_names) == COLUMNS
+    for name, column in zip(COLUMNS, pandas.read_parquet(made).items(), strict=True):
+        assert column[1].isna().tolist() == polars.read_parquet(made)[name].is_null().to_list()
+    assert polars.read_parquet(made)["temperature_c"].to_list() == [None, 21.5, None]
+    assert table["left_features"].type == pyarrow.int64()
+    for one, other in zip(read_history(path.with_suffix(".parquet"), RIG.fingerprint),
+                          read_history(write_history(path, rows), RIG.fingerprint), strict=True):  # fmt: skip
+        assert torch.equal(one.look.turn, other.look.turn)
+        assert torch.equal(one.look.covariance, other.look.covariance)
+        assert (one.time, one.note, one.features) == (other.time, other.note, other.features)
+    assert Watched.read(made, RIG).times == [1.5, 3.0, 4.0]
+    tail = HistoryTail(made, RIG.fingerprint)
+    assert [len(tail.rows()), len(tail.rows())] == [3, 0]
+
+
+def test_what_is_no_history_becomes_no_parquet(tmp_path: Path) -> None:
+    made = tmp_path / "h.parquet"
+    for text, message in (("a,b\n1,2\n", "not a history"), ("time,rig\n1\n", "damaged"), ("", "no history")):
+        (tmp_path / "h.csv").write_text(text)
+        with pytest.raises(FileError, match=message):
+            save_history(tmp_path / "h.csv", made)
+        assert not made.exists()
+    with pytest.raises(FileError, match="of another rig"):
+        Watched.read(save_history(write_history(tmp_path / "h.csv", [row_of(1.0, None)], "x"), made), RIG)
+    pyarrow.parquet.write_table(pyarrow.table({"a": [1]}), made)
+    with pytest.raises(FileError, match="not a history"):
+        Watched.read(made, RIG)
+    made.write_bytes(b"nothing")
+    with pytest.raises(FileError, match="cannot read"):
+        Watched.read(made, RIG)
 
 
 def test_a_history_is_followed_as_it_grows(tmp_path: Path) -> None:

@@ -8,9 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.arrow import ArrowRows, arrow_table
 from kcal.calibrate.rig.adjustment import Adjustment, all_of
 from kcal.calibrate.rig.initial_poses import TurnedBoard
 from kcal.calibrate.rig.problem import RigProblem
@@ -31,7 +33,7 @@ from kcal.texts import brief
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class RigResult:
+class RigResult(ArrowRows):
     """What `solve_rig` and `calibrate_rig` found.
 
     Convention: `cam_from_local` of camera c is p = rotation[c] (x - center[c]); the local frame is east-north-up of the
@@ -210,6 +212,15 @@ class RigResult:
             contradictions=self.contradictions,
             **self._provenance,
         )
+
+    def to_arrow(self) -> Any:
+        """A `pyarrow.Table` of `items`, one row each: where a camera did not see one, its `NAME_px` is null."""
+        items, nowhere = self.items, (None,) * len(self.names)
+        pixels = np.array([item.pixels or nowhere for item in items], float).reshape(-1, len(nowhere))
+        numbers = {f"{name}_px": pixels[:, c] for c, name in enumerate(self.names)}
+        numbers |= {name: np.array([getattr(one, name) for one in items], float) for name in ("meters", "sigmas")}
+        texts = {name: [getattr(item, name) for item in items] for name in ("source", "name", "reason")}
+        return arrow_table(texts | {"used": np.array([item.used for item in items], bool)} | numbers)
 
     def save(self, path: str | Path) -> Path:
         """Write the rig of the first two cameras as `stereo` gives it; see `kcal.save_rig`."""
