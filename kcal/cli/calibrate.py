@@ -1,4 +1,4 @@
-"""`kcal calibrate`: an observations file to a camera file."""
+"""`kcal calibrate`: observations to camera files; and `kcal batch`: images of many cameras, in parallel."""
 
 from __future__ import annotations
 
@@ -9,20 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 import typer
 
 import kcal
-from kcal.cli import kinds
-from kcal.cli.console import (
-    ending_with,
-    out,
-    print_left_out,
-    print_styled,
-    print_table,
-    print_wrote,
-    steps,
-    tell,
-    views_cure,
-    warn,
-    with_command,
-)
+from kcal.cli import console, kinds
+from kcal.cli.console import err, out, print_styled, print_table, print_wrote, steps, tell, warn
+from kcal.cli.detect import given_board
 from kcal.cli.inputs import BOARD, calibrated_camera, check_file, pixel_sigma_of
 from kcal.cli.options import Kind, Rare, Several
 from kcal.cli.report import NO, judged, told_usable
@@ -32,6 +21,7 @@ from kcal.files import check_picture, check_writable, make_folder
 from kcal.texts import measured_text, number_text, percent_text
 
 if TYPE_CHECKING:
+    from kcal.calibrate.batch.results import SummaryRow
     from kcal.calibrate.camera.result import CameraCalibrationResult
 
 _T = TypeVar("_T")
@@ -93,7 +83,7 @@ def told_calibration(result: CameraCalibrationResult, beside: Path, *, reject: b
     if reject:
         out.print(f"left out: {100 * result.rejected_share:.2f} % of the corners")
     lines = [f"{entry.name}: {entry.reason}" for entry in result.excluded]
-    print_left_out(lines, beside, f"{len(lines)} views and corners were left out")
+    console.print_left_out(lines, beside, f"{len(lines)} views and corners were left out")
     warn(*result.warnings)
     for text in result.advice:
         out.print(f"next: {text}")
@@ -279,13 +269,13 @@ def calibrate_command(
     def cure(error: object, i: int) -> str:
         # Where options name parameters, the views are not to blame.
         named = isinstance(error, InputError) and (fix or tie or prior or free)
-        return "" if named else views_cure(error, sets[i], places[i].observations)
+        return "" if named else console.views_cure(error, sets[i], places[i].observations)
 
     with steps("calibrating", None) as advance:
         if len(sets) > 1:
             outcomes = kcal.calibrate.calibrate_cameras(sets, options, advance, one_type=one_type)
         else:
-            with ending_with(lambda error: cure(error, 0)):
+            with console.ending_with(lambda error: cure(error, 0)):
                 outcomes = [kcal.calibrate_camera(sets[0], options, advance)]
     if stars and not isinstance(outcomes[0], KcalError):
         outcomes = [joined_by_stars(outcomes[0], stars, time, site, places[0].output)]
@@ -296,7 +286,7 @@ def calibrate_command(
         if len(places) > 1:
             print_styled(place.name, ".*")
         if isinstance(result, KcalError):
-            warn(f"{place.name}: {with_command(str(result), cure(result, places.index(place)))}")
+            warn(f"{place.name}: {console.with_command(str(result), cure(result, places.index(place)))}")
             continue
         i = places.index(place)
         stood = {key: numbers[i % len(numbers)] for key, numbers in settings.items()}
@@ -365,3 +355,87 @@ def _camera_files(
         if place.picture is not None:
             check_picture(place.picture)
     return places
+
+
+# `kcal batch`: many cameras at once, in parallel, continued after an interruption.
+
+
+def batch_command(
+    cameras: Path,
+    *,
+    output: kinds.Output,
+    board: kinds.BoardOrAuto = "auto",
+    square: kinds.Square | None = None,
+    model: Annotated[str, Kind(metavar="NAME")] = "hybrid",
+    refine: kinds.RefineMethod = kinds.Refine.erf,
+    board_warp: bool = False,
+    one_type: bool = False,
+    workers: Annotated[int, Kind(least=0)] = 0,
+    scheduler: Annotated[str | None, Kind(metavar="ADDRESS")] = None,
+    time_limit: Annotated[float, Kind(metavar="S", least=1)] = 300.0,
+) -> None:
+    """Calibrate many cameras: images in, observations, camera files and one table out.
+
+    Writes NAME.obs.json and NAME.camera.json for each camera, and summary.csv. Cameras that saw one printed board
+    measure its errors together.
+
+    Finished work is kept in a folder .work: the same command continues an interrupted run, and does only what is new
+    when images, options or cameras were added. A camera or an image that fails is listed with its reason and does not
+    stop the others; the exit code is then 1. Dask workers should have one thread each (--nthreads 1).
+
+    **Examples**
+
+    `kcal batch cameras/ --board 9x6 --square 25mm -o results`
+
+    `kcal batch cameras.csv -o results --workers 4`
+
+    `kcal batch /shared/cameras --board 9x6 --square 25mm -o /shared/results --scheduler tcp://10.0.0.1:8786`
+
+    Args:
+        cameras: A folder with a folder of images for each camera, or a CSV with the columns camera,images and, where
+            they differ, board,square,model.
+        output: Folder for the results; made if it is missing.
+        model: Lens model, see `kcal calibrate`.
+        board_warp: Also estimate how each board bends.
+        one_type: The cameras, four or more, are of one type: each learns from the others.
+        workers: Processes on this machine; one per core if 0.
+        scheduler: Dask scheduler whose workers see the same files: tcp://host:8786.
+        time_limit: Seconds of processor time for one image or one calibration.
+    """
+    from kcal.calibrate.batch.jobs import BatchOptions, pieces, read_jobs
+    from kcal.calibrate.batch.results import calibrate_batch
+
+    given = given_board(board, square)
+    if model != "hybrid":
+        kcal.lens.LensModel.named(model)
+    with steps("looking at the images", None):
+        jobs = read_jobs(cameras, given, model, square)
+    if given is None:
+        for job in jobs:
+            if job.board is not None:
+                out.print(f"{job.name}: board {job.board}")
+    options = BatchOptions(refine=refine.value, board_warp=board_warp, one_type=one_type, time_limit=time_limit)
+    try:
+        with steps("images and cameras", pieces(jobs)) as advance:
+            report = calibrate_batch(jobs, output, options, workers=workers, scheduler=scheduler, progress=advance)
+    except KeyboardInterrupt:
+        err.print("interrupted; what is finished is kept: run the same command to continue")
+        raise typer.Exit(130) from None
+    heads = ["camera", "views", "RMS px", "focal px", "± σ", "cx", "cy", "model", "note"]
+    print_table([heads, *map(_cells, report.rows)], left=(0, 7, 8))
+    out.print(f"{report.reused} of {report.total} pieces of work were there already")
+    print_wrote(report.summary)
+    failed = [row.camera for row in report.rows if row.error]
+    if failed:
+        raise DegenerateError(
+            f"{len(failed)} of {len(report.rows)} cameras failed: {', '.join(failed[:5])}; see the table"
+        )
+
+
+def _cells(row: SummaryRow) -> list[str]:
+    numbers = ["", "", "", "", ""]
+    if row.rms is not None:
+        spread = "" if row.sigma_focal is None else f"{row.sigma_focal:.3f}"
+        numbers = [f"{row.rms:.4f}", f"{row.focal:.3f}", spread, f"{row.cx:.3f}", f"{row.cy:.3f}"]
+    note = f"failed: {row.error}" if row.error else row.warnings
+    return [row.camera, f"{row.views} of {row.images}", *numbers, row.model, note]

@@ -13,10 +13,8 @@ from typer.core import TyperGroup
 
 import kcal
 from kcal.cli import inputs
-from kcal.cli.batch import batch_command
 from kcal.cli.board import app as board
-from kcal.cli.calibrate import calibrate_command
-from kcal.cli.capture import capture_command
+from kcal.cli.calibrate import batch_command, calibrate_command
 from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
 from kcal.cli.console import err, print_label, print_replaced, working
 from kcal.cli.demo import demo_command
@@ -25,8 +23,8 @@ from kcal.cli.exchange import export_command, import_command, schema_command
 from kcal.cli.init import init_command
 from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
-from kcal.cli.mark import mark_command
 from kcal.cli.options import Command, declared
+from kcal.cli.pages import capture_command, mark_command
 from kcal.cli.rectify import rays_command, rectify_command
 from kcal.cli.report import check_command, report_command
 from kcal.cli.rig import app as rig

@@ -104,15 +104,18 @@ class MarkingState:
     survey: Mapping[str, Place] = dataclasses.field(default_factory=dict)
 
 
-class Add(_Strict):
+class _Named(_Strict):
+    name: _Name
+
+
+class Add(_Named):
     """Add an item without marks."""
 
     do: Literal["add"]
-    name: _Name
     kind: Kind
 
 
-class Put(_Strict):
+class Put(_Named):
     """Set a mark.
 
     Args:
@@ -125,42 +128,37 @@ class Put(_Strict):
     """
 
     do: Literal["put"]
-    name: _Name
     side: Side
     mark: Mark
     matched: bool = False
     zoom: Annotated[float, pydantic.Field(gt=0, le=1e4)] | None = None
 
 
-class Take(_Strict):
+class Take(_Named):
     """Remove a mark."""
 
     do: Literal["take"]
-    name: _Name
     side: Side
 
 
-class Drop(_Strict):
+class Drop(_Named):
     """Remove an item with its marks; surveyed places stay."""
 
     do: Literal["drop"]
-    name: _Name
 
 
-class Rename(_Strict):
+class Rename(_Named):
     """Give an item another name or kind."""
 
     do: Literal["rename"]
-    name: _Name
     to: _Name
     kind: Kind
 
 
-class SurveyPlace(_Strict):
+class SurveyPlace(_Named):
     """Type in where a landmark is."""
 
     do: Literal["survey"]
-    name: _Name
     place: Place
 
 

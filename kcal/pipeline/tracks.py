@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import kcal.pipeline.imm_filter as imm
+import kcal.pipeline.measurements as measured
 from kcal.dispatch import known_true
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes
@@ -21,20 +22,7 @@ from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import MOUNTING_ERRORS
 from kcal.pipeline.assignment import Candidates, Looks, Scores, SeenFrom, assigned, looks_of, nearby, within
 from kcal.pipeline.estimates import History, SmoothedTrack, TrackStates, track_states, track_table
-from kcal.pipeline.measurements import (
-    Anchored,
-    ClockEstimate,
-    ClockPrior,
-    SharedErrors,
-    Sightings,
-    anchored,
-    known_sightings,
-    mahalanobis,
-    product,
-    rooted,
-    sightings,
-    squared,
-)
+from kcal.pipeline.measurements import Anchored, ClockEstimate, ClockPrior, SharedErrors, Sightings, anchored
 from kcal.pipeline.pairing import ObjectViews, mark_numbers
 from kcal.texts import brief, briefly
 
@@ -193,11 +181,11 @@ def track_steps(localize: Localizer, lasting_px: float) -> TrackSteps:
     """The steps as they are."""
     centers, errors, bending = localize.rig.center, localize.errors, localize.bending_errors
     turned = None if errors is None else errors[:, :, 3:6].movedim(-1, 0)
-    cameras, known = SeenFrom(centers, turned), known_sightings(localize)
+    cameras, known = SeenFrom(centers, turned), measured.known_sightings(localize)
     k = float(known.posed.bending)
 
     def measure(pixels: Tensor, seen: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
-        return sightings(known, pixels, seen, covariance, time, lasting_px)
+        return measured.sightings(known, pixels, seen, covariance, time, lasting_px)
 
     def looked_at(beliefs: imm.Beliefs, frame: Tensor, home: Tensor, root: Tensor | None) -> tuple[imm.Beliefs, Looks]:
         merged = beliefs.merged()
@@ -514,7 +502,7 @@ class Tracker:
         aim, turn = self.beliefs.middle[:2, 0], None
         if bool((aim.abs() > _TURN).any()):
             turn = _toward(aim)
-            self.frame = product(turn, self.frame)
+            self.frame = measured.product(turn, self.frame)
         elif self.history is None:
             self.beliefs = self.steps.move(self.beliefs, up, numbers, stay)
             return
@@ -670,10 +658,10 @@ class Tracker:
         still = imm.transition(frame.new_tensor(imm.step_numbers((imm.Motion(acceleration=0.0),), 0.0)), frame[:, 2])
         centers = self.localize.rig.center
         apart = centers[self.home[which]] - centers[self.home[new]]
-        shift = None if not bool(apart.any()) else product(to, apart.T[:, None])[:, 0]
-        old = imm.predicted(old, still, product(to, frame.transpose(0, 1)), shift)
-        spread = rooted(here.effect - old.effect, self.shared.mixing)
-        distance = mahalanobis(here.noise + old.noise + squared(spread), here.mean - old.mean)[0][0]
+        shift = None if not bool(apart.any()) else measured.product(to, apart.T[:, None])[:, 0]
+        old = imm.predicted(old, still, measured.product(to, frame.transpose(0, 1)), shift)
+        spread = measured.rooted(here.effect - old.effect, self.shared.mixing)
+        distance = measured.mahalanobis(here.noise + old.noise + measured.squared(spread), here.mean - old.mean)[0][0]
         near = [i for i, value in zip(lost, distance.tolist(), strict=True) if value <= self.options.recognize]
         return near[0] if len(near) == 1 else None
 

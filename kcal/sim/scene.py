@@ -4,31 +4,22 @@ from __future__ import annotations
 
 import functools
 import itertools
+import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from importlib import resources
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
+import kcal.sim.captures as captures
 from kcal.checks import as_points, require_finite
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import Pose
-from kcal.sim.captures import (
-    BoardLike,
-    LensLike,
-    PrintedBoard,
-    TrueRig,
-    area_colors,
-    board_points,
-    check_board,
-    check_pose,
-    drawn_rig,
-    project_board,
-    sample_board_poses,
-)
+from kcal.sim.captures import BoardLike, LensLike, PrintedBoard, TrueRig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.truth import PixelRectangle, TruthLens, grow, pixel_axes
 
@@ -229,8 +220,8 @@ def render_light(
     options = _in_light(options or RenderOptions())
     if isinstance(camera, Camera) and camera.params.ndim != 1:
         raise InputError("render_board: a single camera is needed, got a batch")
-    check_board(board)
-    pose = check_pose(cam_from_board)
+    captures.check_board(board)
+    pose = captures.check_pose(cam_from_board)
     radius = math.ceil(4 * options.blur)
     width, height = camera.size
     image = _background(PixelRectangle(0, 0, width, height), camera.size, options)
@@ -296,7 +287,7 @@ def _paint(
     a: Tensor, b: Tensor, width_a: Tensor, width_b: Tensor, board: BoardLike, options: RenderOptions, around: Tensor
 ) -> Tensor:
     """Gray levels of boxes around board positions, where the background has the gray levels `around`."""
-    paper, black = area_colors(a, b, width_a, width_b, board, options.margin)
+    paper, black = captures.area_colors(a, b, width_a, width_b, board, options.margin)
     return around + (options.white - around) * paper - (options.white - options.black) * black
 
 
@@ -377,7 +368,7 @@ def _paper_window(camera: LensLike, pose: Pose, board: BoardLike, margin: int, r
 
 def _outline(board: BoardLike, border: int) -> Tensor:
     """Points around the rectangle that lies `border` squares outside the inner corners, (4 * 64, 3) meters."""
-    corners = board_points(board, border)
+    corners = captures.board_points(board, border)
     columns = board.columns + 2 * border
     ring = corners[[0, columns - 1, -1, -columns, 0]]
     share = torch.arange(64, dtype=torch.float64)[:, None, None] / 64
@@ -416,29 +407,7 @@ def _blur_to_pixels(light: Tensor, sigma: float, radius: int) -> Tensor:
 # noise in each image alone is 2 % of range at 5 km.
 
 # Name, horizontal distance in meters, degrees to the right of the heading, meters above the rig.
-_TARGETS = (
-    ("gate", 100.0, -8.0, -9.0),
-    ("shed", 250.0, 14.0, -7.0),
-    ("tower", 500.0, -20.0, 12.0),
-    ("truck", 1000.0, 6.0, -10.0),
-    ("mast", 2000.0, -33.5, 25.0),
-    ("pylon", 3500.0, 33.0, 30.0),
-    ("drone", 5000.0, 2.0, 180.0),
-)
-_LANDMARKS = (
-    ("post 1", 120.0, 20.0, -11.5),
-    ("post 2", 180.0, -30.0, -11.2),
-    ("kerb", 260.0, -4.0, -12.0),
-    ("chimney", 420.0, 30.0, 18.0),
-    ("roof", 650.0, -14.0, 3.0),
-    ("silo", 900.0, 11.0, 16.0),
-    ("antenna", 1500.0, -23.0, 40.0),
-    ("ridge", 2600.0, 4.0, 90.0),
-    ("well", 150.0, 9.0, -12.5),
-    ("barn", 340.0, -18.0, 9.0),
-    ("bridge", 1150.0, -8.0, -24.0),
-    ("hill", 2100.0, 19.0, 120.0),
-)
+_PLAIN = json.loads(resources.files("kcal.sim").joinpath("plain.json").read_text(encoding="utf-8"))
 _NEAR_BOARD = PrintedBoard(9, 6, 0.06, seed=1)
 # mm: the focal length that 1600 px are on a sensor of 1/2.8 inch, whose pixels measure 2.9 µm.
 FOCAL_MM = 4.64
@@ -490,7 +459,7 @@ def demo_rig() -> TrueRig:
         >>> round(float(demo_rig().baseline), 3)
         10.0
     """
-    return drawn_rig(SURVEILLANCE, 1.0, 1, focal_mm=FOCAL_MM, wander=1.0)
+    return captures.drawn_rig(SURVEILLANCE, 1.0, 1, focal_mm=FOCAL_MM, wander=1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -539,8 +508,8 @@ class DemoScene:
     render: RenderOptions = _RENDER
     mark_sigma: float = 0.1
     survey_sigma: float = 0.02
-    targets_at: Places = _TARGETS
-    landmarks_at: Places = _LANDMARKS
+    targets_at: Places = tuple(map(tuple, _PLAIN["targets"]))
+    landmarks_at: Places = tuple(map(tuple, _PLAIN["landmarks"]))
 
     @property
     def images(self) -> int:
@@ -661,7 +630,7 @@ def render_demo(scene: DemoScene, progress: Callable[[str], None] | None = None)
     for index, (side, name, pose) in enumerate(scene_views(scene)):
         camera = getattr(scene.rig, side)
         image = render_board(camera, pose, scene.near_board, scene.render, scene.generator(index))
-        corners, _ = project_board(camera, pose, scene.near_board)
+        corners, _ = captures.project_board(camera, pose, scene.near_board)
         if progress is not None:
             progress(f"{side} {name}")
         yield DemoView(side, name, image, corners, pose)
@@ -672,6 +641,6 @@ def scene_views(scene: DemoScene) -> Iterator[tuple[Literal["left", "right"], st
     sides: tuple[Literal["left", "right"], ...] = ("left", "right")
     for stream, side in enumerate(sides):
         camera = getattr(scene.rig, side)
-        poses = sample_board_poses(camera, scene.near_board, scene.near_views, scene.generator(-10 - stream))
+        poses = captures.sample_board_poses(camera, scene.near_board, scene.near_views, scene.generator(-10 - stream))
         for number, pose in enumerate(poses, 1):
             yield side, f"near-{number:02d}", pose

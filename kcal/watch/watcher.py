@@ -339,17 +339,9 @@ def alarm_sigmas(every_s: float) -> float:
     return math.sqrt(2.0) * float(torch.erfinv(torch.tensor(1.0 - 2.0 / tries, dtype=torch.float64)))
 
 
-class Exceeded(NamedTuple):
-    """Which of three angles (..., 3) are beyond the limit, and whether any is (...)."""
-
-    angles: Tensor
-    any: Tensor
-
-
-def exceeded(turn: Tensor, sigma: Tensor, limit_deg: float, every_s: float) -> Exceeded:
-    """Whether a relative turn (..., 3) with standard deviations (..., 3), radians, is surely beyond a limit."""
-    beyond = turn.abs() - alarm_sigmas(every_s) * sigma > math.radians(limit_deg)
-    return Exceeded(beyond, beyond.any(-1))
+def exceeded(turn: Tensor, sigma: Tensor, limit_deg: float, every_s: float) -> Tensor:
+    """Which angles (..., 3) of a relative turn, with standard deviations, radians, are surely beyond a limit."""
+    return turn.abs() - alarm_sigmas(every_s) * sigma > math.radians(limit_deg)
 
 
 class Webhook:
@@ -561,7 +553,7 @@ class Watcher:
             text = past.history_head() + text
         self._ledger.append([text.encode()], row.time, round(1e6 * row.time) + 1)
         self.looks += 1
-        alarm = bool(exceeded(steady.relative, sigma, self.limit_deg, self.every_s).any)
+        alarm = bool(exceeded(steady.relative, sigma, self.limit_deg, self.every_s).any())
         # One that ends within the noise of the limit has not ended.
         alarm = alarm or (self._alarm and float(steady.relative.abs().max()) > math.radians(self.limit_deg))
         begins, self._alarm = alarm and not self._alarm, alarm

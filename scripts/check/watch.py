@@ -232,7 +232,7 @@ def day_and_night(
     model = learned_each(true, found[:skip], every)
     told = Told(*(values[skip:] for values in filtered(found, every, model)))
     true = true._replace(slow=true.slow[skip:], seen=true.seen[skip:], kelvin=true.kelvin[skip:])
-    raised = exceeded(told.steady, told.sigma, LIMIT, every).any
+    raised = exceeded(told.steady, told.sigma, LIMIT, every).any(-1)
     false = raised & ((true.slow @ ROWS[:3].T).abs().amax(-1) < math.radians(LIMIT))
     begins = int((false[1:] & ~raised[:-1]).sum()) + int(false[0].sum())
     really, day = true.slow @ ROWS[1], true.seen == FEATURES
@@ -262,7 +262,7 @@ def drifts(chains: int, every: float, model: TurnModel) -> list[list[object]]:
         slow[..., 4] += (since / ramp_s).clamp(0.0, 1.0) * DRIFT * sign
         short = true._replace(slow=slow, seen=true.seen[: skip // 4], kelvin=true.kelvin[: skip // 4])
         told = filtered(looks(short, every, 13, heat=False), every, model)
-        ever = (exceeded(told.steady, told.sigma, LIMIT, every).any & (since >= 0)).double()
+        ever = (exceeded(told.steady, told.sigma, LIMIT, every).any(-1) & (since >= 0)).double()
         at = torch.where(ever.any(0), since.gather(0, ever.argmax(0)[None])[0], math.inf)
         seen = (true.seen[: skip // 4] > 0) & (since >= 0) & (since <= 600.0)
         by = (at[seen.sum(0) >= 3] <= 600.0 + (ramp_s if ramp_s > 1 else 0.0)).double()

@@ -191,9 +191,9 @@ def test_alarms_need_a_limit_surely_passed() -> None:
     sigmas = alarm_sigmas(60.0)
     turn = torch.tensor([0.0, math.radians(0.01), 0.0]).double()
     sure = torch.full((3,), math.radians(0.005) / sigmas * 0.99).double()
-    assert exceeded(turn, sure, 0.005, 60.0).angles.tolist() == [False, True, False]
-    assert not bool(exceeded(turn, sure * 1.02, 0.005, 60.0).any)
-    assert bool(exceeded(-turn, sure, 0.005, 60.0).any)
+    assert exceeded(turn, sure, 0.005, 60.0).tolist() == [False, True, False]
+    assert not bool(exceeded(turn, sure * 1.02, 0.005, 60.0).any())
+    assert bool(exceeded(-turn, sure, 0.005, 60.0).any())
 
 
 def test_temperatures_of_a_growing_table(tmp_path: Path) -> None:
