@@ -1,18 +1,24 @@
-"""`kcal board`: a board to print, and a printed board measured."""
+"""`kcal board` and `kcal detect`: a board to print, a printed board measured, and a board found in images."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
+import re
+import shlex
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import kcal
 from kcal.cli import kinds
-from kcal.cli.console import out, print_wrote, steps, warn
+from kcal.cli.console import board_words, ending_with, err, out, print_left_out, print_wrote, steps, tell, warn
+from kcal.cli.inputs import typed, typed_with
 from kcal.cli.options import Command, Kind, declared, group_with_default
 from kcal.errors import InputError
-from kcal.files import write_atomic
+from kcal.files import check_writable, is_stream, make_folder, source_name, write_atomic
 
 app = typer.Typer(
     cls=group_with_default("print"), rich_markup_mode="markdown", help="Draw a board to print, and measure it later."
@@ -121,3 +127,182 @@ def measure_command(
 
 app.command("print", cls=Command)(declared(print_command))
 app.command("measure", cls=Command)(declared(measure_command))
+
+
+# `kcal detect`: images to an observations file.
+
+
+def detect_command(
+    images: list[kinds.Images],
+    *,
+    output: kinds.NewFile,
+    board: kinds.BoardOrAuto = "auto",
+    square: kinds.Square | None = None,
+    refine: kinds.RefineMethod = "erf",
+    gallery: kinds.Picture | None = None,
+    coverage: kinds.Picture | None = None,
+    time_limit: Annotated[float, Kind(metavar="S", least=0.1)] = 60.0,
+    duration: Annotated[float, Kind(metavar="S", least=1.0)] = 120.0,
+    keep: Path | None = None,
+) -> None:
+    """Find the board in the images of one camera.
+
+    The images tell which board it is; --square tells its size. Writes the corners of each view, and the reason for each
+    image in which no board was found. EXIF orientation is ignored: pixels are used as the sensor wrote them. Nothing is
+    written if no image shows the board, or if more images show another one.
+
+    **Examples**
+
+    `kcal detect left/ --square 25mm -o left.obs.json`
+
+    `kcal detect left/ --board 9x6 --square 25mm -o left.obs.json`
+
+    `kcal detect left/ --board charuco:9x6:5x5_100:18mm --square 25mm -o left.obs.json`
+
+    `kcal detect rtsp://10.0.0.7/main --board 9x6 --square 25mm -o left.obs.json --duration 60 --keep frames/`
+
+    `kcal detect "shots/left*.png" --board 9x6 --square 25mm -o left.obs.json --refine opencv`
+
+    Args:
+        images: Images of one camera: files, folders or quoted wildcards; or one video, or a stream (rtsp://...,
+            camera:0).
+        output: Observations file to write.
+        gallery: Images that failed and why, then the views with their corners, worst first.
+        coverage: Where in the image corners were seen.
+        time_limit: Seconds of processor time after which the search in one image is given up.
+        duration: Seconds for which a stream is watched.
+        keep: Folder for the frames of a video or stream that became views, as PNG.
+    """
+    given = given_board(board, square)
+
+    from kcal.corners.detect import Detection
+    from kcal.corners.images import expand_images, is_video, turned_images
+
+    failed: list[tuple[str, Path, Detection]] = []
+
+    turned: list[Path] = []
+    notes: list[str] = []
+    streams = [source_name(image) for image in images if is_stream(image)]
+    if streams and len(images) > 1:
+        raise InputError(f"{streams[0]}: a stream is searched alone, without other images")
+    if keep is not None:
+        make_folder(keep)
+    if len(images) == 1 and is_video(images[0]):
+        searched: list[str] = []
+        pattern = given or board_in_images(images, square, time_limit)
+        with steps(f"watching {streams[0]} for {duration:g} s" if streams else "searching the video", None):
+            observations = kcal.corners.detect_video(
+                images[0], pattern, refine, progress=searched.append, time_limit=time_limit, duration=duration,
+                keep=keep,
+            )  # fmt: skip
+        source = f"of {len(searched)} sharp frames (repeats left out)"
+    else:
+        paths = expand_images(images)
+        check_writable(output, *paths)
+        pattern = given or board_in_images(paths, square, time_limit)
+        with (
+            ending_with(lambda error: _next_command(str(error), board, pattern, images, paths, output)),
+            steps("detecting", len(paths)) as advance,
+        ):
+            observations = kcal.detect(
+                paths,
+                pattern,
+                refine,
+                progress=advance,
+                time_limit=time_limit,
+                note=notes.append,
+                on_failure=lambda name, path, found: failed.append((name, path, found)),
+            )
+        turned = turned_images([path for path in paths if os.path.isfile(path)])
+        source = f"of {len(paths)} images"
+    observations.save(output)
+    if gallery is not None or coverage is not None:
+        from kcal.report.calibration import FailedImage, coverage_figure, gallery_figure
+
+        if gallery is not None:
+            tiles = [FailedImage(name, path, found.reason, found.rejected) for name, path, found in failed]
+            kcal.report.save_picture(gallery, gallery_figure(observations, tiles))
+        if coverage is not None:
+            kcal.report.save_picture(coverage, coverage_figure(observations))
+
+    width, height = observations.image_size
+    found, unseen = len(observations.views), sum(view.pixels.count(None) for view in observations.views)
+    tell(views=found, failures={failure.name: failure.reason for failure in observations.failures})
+    out.print(f"{output}: board found in {found} {source} of {width}x{height} px")
+    wide, high = (1e3 * side for side in pattern.extent)
+    out.print(f"board {pattern}: {wide:g} x {high:g} mm from the first point to the last")
+    warn(*notes)
+    if turned:
+        out.print(
+            f"note: {len(turned)} images have an EXIF rotation, of {len(paths)}, which kcal ignores: corners are in "
+            "pixels of the sensor"
+        )
+    if unseen:
+        out.print(f"corners left out as uncertain: {unseen} of {found * pattern.corners}")
+    print_left_out(
+        [f"failed {failure.name}: {failure.reason}" for failure in observations.failures],
+        output,
+        f"{len(observations.failures)} images failed",
+    )
+    if not pattern.unambiguous:
+        out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
+
+
+def given_board(size: str, square: str | None) -> kcal.Board | None:
+    """The board that `--board` and `--square` say; None where the images have to tell it."""
+    return None if size == "auto" else kcal.Board.parse(size, square)
+
+
+def board_in_images(images: Sequence[str | Path], square: str | None, time_limit: float | None = None) -> kcal.Board:
+    """The board that images, a video or a stream show; it is said."""
+    from kcal.corners.images import is_video
+    from kcal.corners.recognize import Recognized
+    from kcal.corners.video import spread_frames
+
+    def say(found: Recognized) -> None:
+        if found.seen is not None:
+            tell(board=found.seen.text)
+            err.print(f"board {found.seen.text}, seen in {found.votes} of {found.looked} images that were looked at")
+
+    first = images[0]
+    with steps("looking for a board", None):
+        return kcal.corners.recognize_board(
+            spread_frames(first) if is_video(first) else images, square, time_limit=time_limit, note=say
+        )
+
+
+_CURED = 6  # images that are looked at to name the board of a refusal
+
+
+def _next_command(
+    refusal: str, given: str, board: kcal.Board, images: Sequence[str], paths: Sequence[Path], output: Path
+) -> str:
+    """The command for images of each size, that with the board that was found, or one that draws the board."""
+    if "different sizes" in refusal:
+        return f"To split them: {' && '.join(_of_each_size(images, paths, output))}"
+    found = re.search(r"a board of (\d+x\d+)", refusal) or re.search(r"give --board ((?:\w+:)?\d+x\d\S*)$", refusal)
+    text = found[1] if found else ""
+    if "COLUMNSxROWS" in refusal:
+        from kcal.corners.detect import recognize_images
+
+        seen = recognize_images(paths, _CURED).seen
+        text = seen.text if seen is not None else ""
+    if text and given in typed:
+        return f"Perhaps: {typed_with({given: text})}"
+    return f"To see what this board looks like: kcal board {board_words(board)} -o board.svg"
+
+
+def _of_each_size(images: Sequence[str], paths: Sequence[Path], output: Path) -> Iterator[str]:
+    """A command for the images of each size, those of most first; sizes that may be of one camera stay together."""
+    from kcal.corners.detect import size_of
+    from kcal.corners.observations import nearly, resized_alike
+
+    groups: dict[tuple[int, int], list[str]] = {}
+    for path in paths:
+        if (size := size_of(path)) is not None:
+            alike = (other for other in groups if nearly(size, other) or resized_alike(size, other))
+            groups.setdefault(next(alike, size), []).append(str(path))
+    for (width, height), files in sorted(groups.items(), key=lambda group: -len(group[1])):
+        own = output.with_name(f"{output.name.split('.')[0]}-{width}x{height}.obs.json")
+        words = [str(own) if word == str(output) else word for word in typed if word not in images]
+        yield shlex.join(["kcal", words[0], *files, *words[1:]])

@@ -10,8 +10,8 @@ import typer
 
 import kcal
 from kcal.cli import console, kinds
+from kcal.cli.board import given_board
 from kcal.cli.console import err, out, print_styled, print_table, print_wrote, steps, tell, warn
-from kcal.cli.detect import given_board
 from kcal.cli.inputs import BOARD, calibrated_camera, check_file, pixel_sigma_of
 from kcal.cli.options import Kind, Rare, Several
 from kcal.cli.report import NO, judged, told_usable
@@ -367,7 +367,7 @@ def batch_command(
     board: kinds.BoardOrAuto = "auto",
     square: kinds.Square | None = None,
     model: Annotated[str, Kind(metavar="NAME")] = "hybrid",
-    refine: kinds.RefineMethod = kinds.Refine.erf,
+    refine: kinds.RefineMethod = "erf",
     board_warp: bool = False,
     one_type: bool = False,
     workers: Annotated[int, Kind(least=0)] = 0,
@@ -414,7 +414,7 @@ def batch_command(
         for job in jobs:
             if job.board is not None:
                 out.print(f"{job.name}: board {job.board}")
-    options = BatchOptions(refine=refine.value, board_warp=board_warp, one_type=one_type, time_limit=time_limit)
+    options = BatchOptions(refine=refine, board_warp=board_warp, one_type=one_type, time_limit=time_limit)
     try:
         with steps("images and cameras", pieces(jobs)) as advance:
             report = calibrate_batch(jobs, output, options, workers=workers, scheduler=scheduler, progress=advance)

@@ -14,9 +14,9 @@ import typer
 from typer.main import get_command
 
 import kcal
+from kcal.cli.board import detect_command
 from kcal.cli.calibrate import calibrate_command
 from kcal.cli.console import out, print_label, print_styled, print_table, steps
-from kcal.cli.detect import detect_command
 from kcal.cli.locate import locate_command
 from kcal.cli.options import Command, declared
 from kcal.cli.report import report_command

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import datetime
 import math
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar
 
 from kcal import values
 from kcal.cli import inputs
@@ -136,17 +135,7 @@ def _read_origin(text: str, name: str) -> Origin:
 Site = Annotated["Origin", Kind(metavar="LAT,LON,HEIGHT", read=_read_origin)]
 
 
-# Boards. What a corner is refined by has the names of `kcal.corners.refine.Refinement`.
-
-
-class Refine(StrEnum):
-    """Names of the refinements, for the command line."""
-
-    erf = "erf"
-    saddle = "saddle"
-    opencv = "opencv"
-    skimage = "skimage"
-    none = "none"
+# Boards.
 
 
 _PATTERNS = (
@@ -164,7 +153,11 @@ Square = Annotated[
         "2.5cm, 1in. Not with a target file.",
     ),
 ]
-RefineMethod = Annotated[Refine, Kind(metavar="METHOD", about="erf (most accurate), saddle, opencv, skimage or none.")]
+# The names of `kcal.corners.refine.Refinement`.
+RefineMethod = Annotated[
+    Literal["erf", "saddle", "opencv", "skimage", "none"],
+    Kind(metavar="METHOD", about="erf (most accurate), saddle, opencv, skimage or none."),
+]
 
 
 def _read_needs(text: str, _name: str) -> tuple[Requirement, ...]:

@@ -14,11 +14,11 @@ from typer.core import TyperGroup
 import kcal
 from kcal.cli import inputs
 from kcal.cli.board import app as board
+from kcal.cli.board import detect_command
 from kcal.cli.calibrate import batch_command, calibrate_command
 from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
 from kcal.cli.console import err, print_label, print_replaced, working
 from kcal.cli.demo import demo_command
-from kcal.cli.detect import detect_command
 from kcal.cli.exchange import export_command, import_command, schema_command
 from kcal.cli.init import init_command
 from kcal.cli.live import live_command

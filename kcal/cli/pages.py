@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import kcal
 from kcal.cli import kinds
+from kcal.cli.board import board_in_images, given_board
 from kcal.cli.console import err, out, show_page, warn
-from kcal.cli.detect import board_in_images, given_board
 from kcal.cli.inputs import IMAGES, pixel_sigma_of
 from kcal.cli.options import Kind
 from kcal.errors import InputError, KcalError, with_extra
@@ -119,7 +119,7 @@ def capture_command(
     square: kinds.Square | None = None,
     until: kinds.Pixels = 0.1,
     most: Annotated[int, Kind(metavar="N", least=4)] = 60,
-    refine: kinds.RefineMethod = kinds.Refine.erf,
+    refine: kinds.RefineMethod = "erf",
     page: bool = True,
     port: Annotated[int, Kind(least=0)] = _CAPTURE_PORT,
     browser: bool = True,
@@ -153,7 +153,7 @@ def capture_command(
     if pattern is None and output.exists():
         pattern = kcal.Observations.load(output).board
     pattern = pattern or board_in_images([source], square)
-    session = CaptureSession(output, pattern, CaptureOptions(until=until, most=most, refine=refine.value))
+    session = CaptureSession(output, pattern, CaptureOptions(until=until, most=most, refine=refine))
     if session.views:
         err.print(f"{output} has {session.views} views; going on")
     stop = threading.Event()
