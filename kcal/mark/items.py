@@ -104,18 +104,18 @@ class MarkingState:
     survey: Mapping[str, Place] = dataclasses.field(default_factory=dict)
 
 
-class _Named(_Strict):
+class _OfItem(_Strict):
     name: _Name
 
 
-class Add(_Named):
+class Add(_OfItem):
     """Add an item without marks."""
 
     do: Literal["add"]
     kind: Kind
 
 
-class Put(_Named):
+class Put(_OfItem):
     """Set a mark.
 
     Args:
@@ -134,20 +134,20 @@ class Put(_Named):
     zoom: Annotated[float, pydantic.Field(gt=0, le=1e4)] | None = None
 
 
-class Take(_Named):
+class Take(_OfItem):
     """Remove a mark."""
 
     do: Literal["take"]
     side: Side
 
 
-class Drop(_Named):
+class Drop(_OfItem):
     """Remove an item with its marks; surveyed places stay."""
 
     do: Literal["drop"]
 
 
-class Rename(_Named):
+class Rename(_OfItem):
     """Give an item another name or kind."""
 
     do: Literal["rename"]
@@ -155,7 +155,7 @@ class Rename(_Named):
     kind: Kind
 
 
-class SurveyPlace(_Named):
+class SurveyPlace(_OfItem):
     """Type in where a landmark is."""
 
     do: Literal["survey"]
