@@ -18,6 +18,7 @@ from torch import Tensor
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
+from kcal.calibrate.camera.solve import calibrate_parametric
 from kcal.calibrate.camera.warnings import board_distances, corner_pupil, distance_text
 from kcal.calibrate.hybrid.fitted_views import moving_residuals
 from kcal.calibrate.problem.poses import poses_under
@@ -240,7 +241,13 @@ def _splits(names: list[str]) -> list[tuple[str, bool, tuple[list[str], list[str
 def _compare(
     seen: Observations, parts: tuple[list[str], list[str]], options: CalibrationOptions, label: str, alike: bool
 ) -> HalvesDifference:
-    results = [calibrate_camera(seen.subset(part), options) for part in parts]
+    # A parametric lens stands for OpenCV's, which nobody asks whether it is one camera's.
+    results = [
+        calibrate_camera(seen.subset(part), options)
+        if options.hybrid
+        else calibrate_parametric(seen.subset(part), options, lambda _: None)
+        for part in parts
+    ]
     sums = torch.zeros(3, dtype=torch.float64)
     corners = 0
     for fitted, other in (results, results[::-1]):
