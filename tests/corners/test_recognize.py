@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from command_line import Command
@@ -109,7 +110,9 @@ def test_boards_of_strangers(images: str, text: str, kcal_data: Path) -> None:
 
 
 def test_a_false_hit_does_not_make_another_board(kcal_data: Path, tmp_path: Path, command: Command) -> None:
-    """OpenCV finds 8x8 corners in one image of a board of 7x7."""
+    """OpenCV 5.0 finds 8x8 corners in one image of a board of 7x7; 5.1 does not."""
+    if not cv2.__version__.startswith("5.0"):
+        pytest.skip("this OpenCV has no such false hit")
     files = [kcal_data / "captures" / "pi640" / f"img{number}.jpg" for number in (9, 1, 5, 7)]
     wrong = Board.parse("8x8", "25mm")
     assert detect_board(shots(Board.parse("9x6", "25mm"), 0.4, TILTS[0])[0], wrong).pixels is None
