@@ -6,7 +6,9 @@ named in `SECTIONS` come first, others of the folder follow by name.
 
 from __future__ import annotations
 
+import base64
 import inspect
+import json
 import re
 from collections.abc import Iterator
 from fnmatch import fnmatch
@@ -25,6 +27,7 @@ DOCS = ROOT / "docs"
 # Title and folder of each section, and its pages in the order in which they are read.
 SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("Tutorial", "tutorial", ("guide",)),
+    ("Notebooks", "notebooks", ("one-camera", "rig-to-map", "training")),
     (
         "How to",
         "howto",
@@ -67,7 +70,8 @@ def navigation() -> list[Any]:
 
 
 def _generated(folder: str) -> list[str]:
-    return ["commands"] if folder == "reference" else []
+    notebooks = [path.stem for path in (DOCS / folder).glob("*.ipynb")]
+    return [*notebooks, "commands"] if folder == "reference" else notebooks
 
 
 def with_descriptions(door: str, markdown: str) -> str:
@@ -131,6 +135,32 @@ def conclusions_page() -> str:
     return "\n".join(lines)
 
 
+def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
+    """A notebook with its stored outputs as a page, and the pictures of that page by name."""
+    pictures: dict[str, bytes] = {}
+
+    def picture(data: str) -> str:
+        name = f"{path.stem}-{len(pictures) + 1}.png"
+        pictures[name] = base64.b64decode(data)
+        return name
+
+    parts = []
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for output in cell.get("outputs", ()):
+            shown = {kind: "".join(text) for kind, text in output.get("data", {"text": output.get("text")}).items()}
+            if html := shown.get("text/html"):
+                html = re.sub(r"data:image/png;base64,([\w+/=]+)", lambda found: picture(found[1]), html)
+                parts.append(f'<div class="output">{html}</div>')
+            elif "image/png" in shown:
+                parts.append(f"![Output of the cell above]({picture(shown['image/png'])})")
+            else:
+                parts.append(f"```text\n{shown.get('text/plain', shown.get('text'))}\n```")
+    parts.insert(1, f'<a href="{path.name}" download>This page as a notebook</a>')
+    return "\n\n".join(parts), pictures
+
+
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     config.nav = navigation()
     return config
@@ -143,6 +173,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages |= {f"reference/{name.lower()}": (ROOT / name).read_text(encoding="utf-8") for name in OUTSIDE}
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))
+    for path in sorted(DOCS.glob("notebooks/*.ipynb")):
+        page, pictures = notebook_page(path)
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=page))
+        for name, data in pictures.items():
+            files.append(File.generated(config, f"notebooks/{name}", content=data))
     for path in sorted((ROOT / "assets").rglob("*.*")):
         name = path.relative_to(ROOT).as_posix()
         files.append(File.generated(config, name, abs_src_path=str(path)))
@@ -161,6 +196,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
         return with_descriptions(PYTHON[page.file.src_uri], markdown)
     if page.file.src_uri in {f"reference/{name.lower()}" for name in OUTSIDE}:
         return re.sub(r"\]\(docs/", "](../", markdown)
+    markdown = re.sub(r"(\]\([\w/.-]+)\.ipynb\)", r"\1.md)", markdown)
     up = "../" * page.file.src_uri.count("/")
     return re.sub(rf"\]\({re.escape(up)}\.\./(?=assets/)", f"]({up}", markdown)
 

@@ -119,7 +119,8 @@ def test_every_page_is_in_the_navigation() -> None:
     made = {name for name in names if name not in pages}
     assert pages < set(names)
     # The others are made of the code when the site is built.
-    assert {name for name in made if not name.startswith("reference/")} == {"measured/index.md"}
+    notebooks = {f"notebooks/{path.stem}.md" for path in (ROOT / "docs").rglob("*.ipynb")}
+    assert {name for name in made if not name.startswith("reference/")} == {"measured/index.md"} | notebooks
 
 
 def test_pages_without_a_place_follow_those_that_have_one() -> None:

@@ -41,6 +41,9 @@ class PlainFigure(Figure):
     Names come from other people's files, and one that is no valid mathematics would stop the drawing.
     """
 
+    def _repr_png_(self) -> bytes:
+        return picture_bytes(self)
+
     def draw(self, renderer: RendererBase) -> None:
         """Draw everything; called by the canvas."""
         for axes in self.findobj(Axes):
