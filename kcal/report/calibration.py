@@ -13,7 +13,7 @@ import numpy.typing as npt
 import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, Normalize
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 from torch import Tensor
@@ -39,11 +39,15 @@ from kcal.report.figures import (
     add_color_bar,
     draw_arrows,
     draw_values,
+    finished,
     frame_image,
     framed_figure,
     image_figure,
+    image_panel,
+    one_panel,
     round_levels,
     shortened,
+    whole,
 )
 from kcal.texts import measured_text, number_text, percent_text
 from kcal.threads import in_one_thread
@@ -57,12 +61,15 @@ _RMS_COLORS = LinearSegmentedColormap.from_list("rms", ["#bcd6ee", ACCENT, WARN]
 
 
 @in_one_thread
-def calibration_figure(result: CameraCalibrationResult, name: str = "") -> Figure:
+def calibration_figure(
+    result: CameraCalibrationResult, name: str = "", figure: Figure | SubFigure | None = None
+) -> Figure:
     """Draw a calibration: coverage with magnified residuals, uncertainty over the image, residuals, RMS of each view.
 
     Args:
         result: from `calibrate_camera`.
         name: of the camera, for the title.
+        figure: of yours, or a part of it, to draw into.
 
     Returns:
         A matplotlib figure that belongs to no window and no global state; its four axes may be changed.
@@ -96,14 +103,14 @@ def calibration_figure(result: CameraCalibrationResult, name: str = "") -> Figur
     width, height = result.observations.image_size
     tall = min(5.9 * height / width, 8.0)
     title = f"{whose}{views}{model}, RMS {result.rms:.3f} px"
-    figure = framed_figure(13.5, tall + 4.4, title)
+    figure = framed_figure(13.5, tall + 4.4, title, into=figure)
     above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(tall + 0.9, 3.5)))
     images, bars = above.subplots(1, 2), below.subplots(1, 2, width_ratios=(1.0, 2.4))
     draw_coverage(images[0], result)
     draw_uncertainty(images[1], result)
     draw_residuals(bars[0], result)
     draw_view_rms(bars[1], result)
-    return figure
+    return whole(figure)
 
 
 def draw_coverage(axes: Axes, result: CameraCalibrationResult) -> None:
@@ -224,7 +231,7 @@ def board_text(board: MeasuredBoard) -> list[str]:
     ]
 
 
-def board_figure(board: MeasuredBoard) -> Figure:
+def board_figure(board: MeasuredBoard, ax: Axes | None = None) -> Figure:
     """Draw heights over the best plane and in-plane displacements from the best fit of the ordered board."""
     corners = 1e3 * board.board.points
     low, high = corners[:, :2].amin(0), corners[:, :2].amax(0)
@@ -238,8 +245,7 @@ def board_figure(board: MeasuredBoard) -> Figure:
     square = 1e3 * board.board.square
     head = [*board_text(board), "colors: height over the best plane; arrows: displacement in the plane"]
     tall_inches = min(9.0, 7.0 * (tall + 2 * square) / (wide + 2 * square)) + 0.8
-    figure = framed_figure(9.0, tall_inches, f"{board.name}: {board.board}", head)
-    axes = figure.add_subplot()
+    axes = one_panel(ax, 9.0, tall_inches, f"{board.name}: {board.board}", head)
     most = max(float(np.abs(heights).max()), _LEAST)
     levels = MaxNLocator(nbins=20, symmetric=True).tick_values(-1.0001 * most, 1.0001 * most)
     drawn = draw_values(axes, places.view(down, _ACROSS, 3).numpy(), heights, list(levels), "RdBu_r")
@@ -251,15 +257,14 @@ def board_figure(board: MeasuredBoard) -> Figure:
     # The longest arrow is nearly as long as the corners are apart.
     draw_arrows(axes, corners[:, :2].numpy(), moved, 0.9 * square / longest, "mm", width=0.0028)
     axes.spines[["top", "right"]].set_visible(False)
-    return figure
+    return finished(axes)
 
 
-def models_figure(compared: ComparisonResult, title: str = "") -> Figure:
+def models_figure(compared: ComparisonResult, title: str = "", ax: Axes | None = None) -> Figure:
     """Draw the held-out RMS of each model, the best first, with the standard error of its difference from the best."""
     ranked = [entry for entry in compared.ranking if math.isfinite(entry[1])]
     names, rms, _, error = zip(*ranked, strict=True)
-    figure = framed_figure(7.6, 1.1 + 0.45 * len(ranked), title)
-    axes = figure.add_subplot()
+    axes = one_panel(ax, 7.6, 1.1 + 0.45 * len(ranked), title)
     axes.axvline(rms[0], color=FAINT, linewidth=0.8)
     axes.errorbar(rms, range(len(ranked)), xerr=error, fmt="o", color=ACCENT, capsize=4)
     axes.set_yticks(range(len(ranked)), names)
@@ -268,7 +273,7 @@ def models_figure(compared: ComparisonResult, title: str = "") -> Figure:
         xlabel="held-out RMS, px (bars: ± standard error of the difference from the best)",
     )
     axes.spines[["top", "right"]].set_visible(False)
-    return figure
+    return finished(axes)
 
 
 # Draw where stated intervals contain the truth: maps of the image, from repeated captures.
@@ -373,7 +378,7 @@ def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = (
     return figure
 
 
-def coverage_figure(observations: Observations) -> Figure:
+def coverage_figure(observations: Observations, ax: Axes | None = None) -> Figure:
     """Draw where corners were seen, in colors for near and far boards, over how many views reached each part.
 
     Parts that no board reached are hatched: the lens model extrapolates there. Their share is the one that `kcal
@@ -395,7 +400,7 @@ def coverage_figure(observations: Observations) -> Figure:
         cells += once > 0
     share = percent_text(1.0 - unreached_share(observations))
     title = f"{len(pixels)} views, {int(seen.sum())} corners; boards reached {share} of the image, hatched: not"
-    figure, (axes,) = image_figure((width, height), 1, title, ["Gray: how many views reached a part of the image."])
+    axes = image_panel(ax, (width, height), title, ["Gray: how many views reached a part of the image."])
     whole = (-0.5, width - 0.5, height - 0.5, -0.5)
     axes.imshow(cells, cmap="Grays", vmin=0, vmax=2.5 * max(cells.max(), 1), extent=whole)
     outside = ~reached(observations, 4 * 65, max(2, round(4 * 65 * height / width))).numpy()
@@ -407,7 +412,7 @@ def coverage_figure(observations: Observations) -> Figure:
     apart = _spacing(observations)[views]
     drawn = axes.scatter(u, v, c=apart, cmap=_NEAR_COLORS, s=9, linewidths=0)
     add_color_bar(drawn, axes, "distance between corners, px (large: board near)")
-    return figure
+    return finished(axes)
 
 
 def _spacing(observations: Observations) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import BoundaryNorm, Colormap
 from matplotlib.contour import ContourSet
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import ArrayLike, NDArray
@@ -47,20 +47,39 @@ class PlainFigure(Figure):
     def draw(self, renderer: RendererBase) -> None:
         """Draw everything; called by the canvas."""
         for axes in self.findobj(Axes):
-            for axis in (axes.xaxis, axes.yaxis):
-                # Names at ticks are written anew at each drawing, by a function.
-                names = axis.get_major_formatter()
-                if isinstance(names, FuncFormatter):
-                    axis.set_major_formatter(partial(_shown_tick, names.func))
-                # This makes the labels of ticks, which otherwise appear only while they are drawn.
-                axis.get_ticklabels(which="both")
+            finished(axes)
         for text in self.findobj(Text):
-            text.set_parse_math(False)
-            text.set_text(_shown(text.get_text()))
+            _make_plain(text)
         with warnings.catch_warnings():
             # A character that the font does not have is drawn as a box.
             warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from font")
             super().draw(renderer)
+
+
+def finished(axes: Axes) -> Figure:
+    """Let the texts of a panel be drawn as they are, also in a figure of the caller's; the figure around it."""
+    for axis in (axes.xaxis, axes.yaxis):
+        # Names at ticks are written anew at each drawing, by a function.
+        names = axis.get_major_formatter()
+        if isinstance(names, FuncFormatter):
+            axis.set_major_formatter(partial(_shown_tick, names.func))
+        # This makes the labels of ticks, which otherwise appear only while they are drawn.
+        axis.get_ticklabels(which="both")
+    for text in axes.findobj(Text):
+        _make_plain(text)
+    return whole(axes.figure)
+
+
+def whole(figure: Figure | SubFigure) -> Figure:
+    """The figure that a part belongs to."""
+    root = figure.figure
+    assert isinstance(root, Figure)
+    return root
+
+
+def _make_plain(text: Text) -> None:
+    text.set_parse_math(False)
+    text.set_text(_shown(text.get_text()))
 
 
 def _shown_tick(names: Callable[[float, int | None], str], at: float, place: int | None) -> str:
@@ -80,8 +99,8 @@ def new_figure(width: float, height: float, dpi: int = 130) -> PlainFigure:
 
 
 def framed_figure(
-    width: float, height: float, title: str = "", notes: Sequence[str] = (), dpi: int = 130
-) -> PlainFigure:
+    width: float, height: float, title: str = "", notes: Sequence[str] = (), dpi: int = 130, into: Any = None
+) -> Any:
     """Make a figure with a title above and notes below, whose axes, labels and color bars share the room between.
 
     Args:
@@ -90,16 +109,37 @@ def framed_figure(
         title: broken into lines where it is too long.
         notes: sentences, likewise.
         dpi: pixels of an inch.
+        into: a figure or subfigure of the caller's to draw into instead, which keeps its size and layout.
     """
     head = wrapped(title, width - 0.3, 13.0) if title else []
     foot = [line for note in notes for line in wrapped(note, width - 0.3, 9.0)]
-    figure = new_figure(width, height + 0.26 * len(head) + 0.18 * len(foot), dpi)
-    figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
+    figure = into
+    if into is None:
+        figure = new_figure(width, height + 0.26 * len(head) + 0.18 * len(foot), dpi)
+        figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
     if head:
         figure.suptitle("\n".join(head), x=0.1 / width, ha="left", fontsize=13, color=INK)
     if foot:
         figure.supxlabel("\n".join(foot), x=0.1 / width, ha="left", fontsize=9, color=GRAY)
     return figure
+
+
+def one_panel(ax: Axes | None, width: float, height: float, title: str = "", notes: Sequence[str] = ()) -> Axes:
+    """Make a framed figure with one panel; or take the caller's panel, which gets the title, and no notes."""
+    if ax is None:
+        return framed_figure(width, height, title, notes).add_subplot()
+    ax.set_title(
+        "\n".join(wrapped(title, 0.8 * ax.get_window_extent().width / ax.figure.dpi, 10.0)), fontsize=10, loc="left"
+    )
+    return ax
+
+
+def image_panel(ax: Axes | None, size: tuple[int, int], title: str = "", notes: Sequence[str] = ()) -> Axes:
+    """The same for a panel of the shape of an image."""
+    if ax is None:
+        return image_figure(size, 1, title, notes)[1][0]
+    frame_image(one_panel(ax, 0.0, 0.0, title), size)
+    return ax
 
 
 def image_figure(

@@ -86,7 +86,7 @@ def _located(located: Located) -> str:
 
 @html_of.register
 def _verdict(verdict: Verdict) -> str:
-    return f"<pre>{page_text(chr(10).join(verdict.lines()))}</pre>"
+    return f'<pre style="white-space: pre-wrap">{page_text(chr(10).join(verdict.lines()))}</pre>'
 
 
 def _picture_html(figure: Figure) -> str:

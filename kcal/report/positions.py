@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
@@ -38,13 +38,16 @@ from kcal.report.figures import (
     draw_north,
     draw_way,
     field_outline,
+    finished,
     framed_figure,
     name_point,
     new_figure,
+    one_panel,
     plain_number,
     round_levels,
     save_picture,
     shortened,
+    whole,
 )
 from kcal.report.tables import range_sigma, range_unit
 from kcal.texts import Unit, length_text, range_text
@@ -70,7 +73,7 @@ _LONGEST = 12.0
 _NAMED = 40
 
 
-def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
+def positions_figure(located: Located, truth: Tensor | None = None, figure: Figure | SubFigure | None = None) -> Figure:
     """Draw located points as seen from above, north up, and their range intervals.
 
     Distances from the left camera are drawn as log(1 + range / r0), so that 100 m and 5 km are both readable; azimuths
@@ -80,6 +83,7 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
     Args:
         located: from `kcal.locate_points`.
         truth: (N, 3) true east, north, up in meters, NaN where unknown; an arrow leads from each to its estimate.
+        figure: of yours, or a part of it, to draw into.
 
     Returns:
         A matplotlib figure that belongs to no window and no global state: the map, then the intervals.
@@ -105,11 +109,11 @@ def positions_figure(located: Located, truth: Tensor | None = None) -> Figure:
     shown = [i for i, position in enumerate(located.positions) if position.range_low_m is not None]
     scale = _scale_of(located, true_enu)
     place = f"{located.place.lat:.6f}°, {located.place.lon:.6f}°, heading {located.heading_deg:g}°"
-    figure = framed_figure(13.0, 6.8, f"{located.count_note}, from {place}", _interval_notes(located))
+    figure = framed_figure(13.0, 6.8, f"{located.count_note}, from {place}", _interval_notes(located), into=figure)
     plan, ranges = figure.subplots(1, 2, width_ratios=[1.45, 1.0])
     _draw_map(plan, located, true_enu, shown, scale)
     _draw_ranges(ranges, located, true_enu, shown)
-    return figure
+    return whole(figure)
 
 
 def _scale_of(located: Located, true_enu: Array | None) -> RangeScale:
@@ -311,15 +315,16 @@ def _interval_notes(located: Located) -> list[str]:
 _REACH = 0.9
 
 
-def stations_figure(located: Located, truth: Tensor | None = None) -> Figure:
+def stations_figure(located: Located, truth: Tensor | None = None, ax: Axes | None = None) -> Figure:
     """Draw a plan, kilometers east and north of the origin.
 
     Args:
         located: from `kcal.locate_points`.
         truth: (N, 3) true east, north, up in meters, NaN where unknown.
+        ax: of yours, to draw into.
     """
-    figure = framed_figure(8.0, 7.0, located.count_note, ["Outlines: 95 % regions. Dashed: bearings without a range."])
-    axes = figure.add_subplot()
+    notes = ["Outlines: 95 % regions. Dashed: bearings without a range."]
+    axes = one_panel(ax, 8.0, 7.0, located.count_note, notes)
     towers = torch.tensor([camera.enu[:2] for camera in located.cameras], dtype=torch.float64)
     found = located.enu[located.enu.isfinite().all(-1)]
     shown = torch.cat([towers, found[:, :2]])
@@ -349,7 +354,7 @@ def stations_figure(located: Located, truth: Tensor | None = None) -> Figure:
         axes.plot(*(truth[truth.isfinite().all(-1)] / 1e3)[:, :2].T, "+", color=WARN, markersize=8)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel="km east", ylabel="km north")
-    return figure
+    return finished(axes)
 
 
 # Draw a depth budget: range errors against range, on logarithmic scales.
@@ -374,18 +379,18 @@ def plotted_ranges(distances: Sequence[float]) -> Tensor:
     return torch.logspace(math.log10(near), math.log10(far), 121, dtype=torch.float64).clamp(near, far)
 
 
-def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[str, str]) -> Figure:
+def budget_figure(
+    distances: Tensor, found: dict[str, RangeError], labels: dict[str, str], ax: Axes | None = None
+) -> Figure:
     """Draw lines for each source: outward error solid, inward dotted, first order thin and dashed.
 
     Args:
         distances: (D,) meters.
         found: errors by source, from `range_errors`.
         labels: source -> text in the legend.
+        ax: of yours, to draw into.
     """
-    figure = framed_figure(
-        8.6, 5.7, "Range error by source", ["Solid: outward. Dotted: inward. Dashed: to first order."]
-    )
-    axes = figure.add_subplot()
+    axes = one_panel(ax, 8.6, 5.7, "Range error by source", ["Solid: outward. Dotted: inward. Dashed: to first order."])
     far = distances.numpy()
     for name, error in found.items():
         color = _SOURCE_COLORS.get(name, "#111827")
@@ -407,7 +412,7 @@ def budget_figure(distances: Tensor, found: dict[str, RangeError], labels: dict[
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=9, loc="upper left")
-    return figure
+    return finished(axes)
 
 
 # A picture of sites: how well an area is seen and located today, and with the candidates that are worth most.

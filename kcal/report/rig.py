@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
 from kcal.calibrate.rig.result import RigResult
@@ -31,11 +31,13 @@ from kcal.report.figures import (
     draw_north,
     draw_way,
     field_outline,
+    finished,
     frame_image,
     framed_figure,
-    image_figure,
+    image_panel,
     name_point,
     shortened,
+    whole,
 )
 from kcal.skyline.attitude import SkylineAttitude
 from kcal.texts import length_text, measured_length, range_text
@@ -60,7 +62,7 @@ _WIDE = 0.1
 
 
 @in_one_thread
-def rig_figure(result: RigResult, narrow: bool = False) -> Figure:
+def rig_figure(result: RigResult, narrow: bool = False, figure: Figure | SubFigure | None = None) -> Figure:
     """Draw a rig on the map, with what it was solved from, and each item's residual in sigmas.
 
     Distances from the rig are drawn as log(1 + range / r0), directions as they are; to scale where the cameras stand as
@@ -69,6 +71,7 @@ def rig_figure(result: RigResult, narrow: bool = False) -> Figure:
     Args:
         result: from `solve_rig` or `calibrate_rig`.
         narrow: for a phone: the bars below the map.
+        figure: of yours, or a part of it, to draw into.
 
     Returns:
         A matplotlib figure that belongs to no window and no global state: the map, then the bars.
@@ -93,12 +96,13 @@ def rig_figure(result: RigResult, narrow: bool = False) -> Figure:
     if len(result.names) == 2:
         size = f"baseline {measured_length(float(apart[0, 1]), result.sigma_baseline)}"
     title = f"Rig of {len(result.names)} cameras, {size}"
-    figure = framed_figure(*((4.4, 8.4, title, _notes(result), 160) if narrow else (13.0, 7.0, title, _notes(result))))
+    width, height, dpi = (4.4, 8.4, 160) if narrow else (13.0, 7.0, 130)
+    figure = framed_figure(width, height, title, _notes(result), dpi, figure)
     parts = figure.subfigures(2, 1) if narrow else figure.subfigures(1, 2, width_ratios=[1.25, 1.0])
     plan, bars = (part.subplots() for part in np.asarray(parts))
     _draw_plan(plan, result, 2 if narrow else 4)
     _draw_items(bars, result)
-    return figure
+    return whole(figure)
 
 
 def _flat(result: RigResult, points: Array) -> Array:
@@ -233,6 +237,7 @@ def stars_figure(
     names: Sequence[str],
     residual: NDArray[np.float64],
     title: str = "",
+    ax: Axes | None = None,
 ) -> Figure:
     """Draw the stars (N, 2) over the image (H, W), its gray levels turned over; the first stars get their names.
 
@@ -242,10 +247,11 @@ def stars_figure(
         names: of each; empty for stars without one.
         residual: (N, 2) projected minus seen; NaN for those.
         title: the line above.
+        ax: of yours, to draw into.
     """
     height, width = image.shape
     known = np.array([bool(name) for name in names], bool)
-    figure, (axes,) = image_figure((width, height), 1, title, ["Arrows: residuals, modeled minus seen."])
+    axes = image_panel(ax, (width, height), title, ["Arrows: residuals, modeled minus seen."])
     # Turned over: stars are dark on a bright sky, so that marks and names can be read.
     axes.imshow(-_above_sky(image), cmap="gray", vmin=-30.0, vmax=2.0, interpolation="nearest")
     axes.plot(*pixels[~known].T, "x", color=WARN, markersize=4, label=f"{int((~known).sum())} without a name")
@@ -257,7 +263,7 @@ def stars_figure(
         longest = max(float(np.linalg.norm(residual[known], axis=1).max()), 1e-3)
         draw_arrows(axes, pixels[known], residual[known], 0.04 * width / longest, color=WARN, width=0.0015)
     axes.legend(loc="lower right", fontsize=8)
-    return figure
+    return finished(axes)
 
 
 def _above_sky(image: NDArray[Any]) -> NDArray[np.float64]:
