@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from kcal.cli.settings import NAME as SETTINGS_FILE
+from kcal.cli.options import NAME as SETTINGS_FILE
 from scripts.docs_site import commands_page, navigation, ordered, with_descriptions
 from scripts.make_reference import DOORS, groups, page, page_of, public
 

@@ -17,7 +17,7 @@ from typer.main import get_command
 
 from kcal import Board, Camera, Observations, View, load_rig, save_camera
 from kcal.cli.main import app
-from kcal.cli.settings import SETTINGS, defaults_of
+from kcal.cli.options import SETTINGS, defaults_of
 from kcal.lens.pose import rotation_from_vector
 
 ROOT = Path(__file__).parents[1]

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from kcal.cli.console import print_wrote
-from kcal.cli.options import Kind, described
-from kcal.cli.settings import NAME, SETTINGS, checked_setting, read_settings
+from kcal.cli.options import NAME, SETTINGS, Kind, checked_setting, described, read_settings
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, write_atomic
 

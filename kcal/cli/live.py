@@ -16,8 +16,7 @@ from kcal.cli import kinds
 from kcal.cli.console import err, on_signals, steps
 from kcal.cli.inputs import pixel_sigma_of
 from kcal.cli.locate import LocateOptions, pair_localizer
-from kcal.cli.options import Kind, Only, Rare
-from kcal.cli.settings import taken
+from kcal.cli.options import Kind, Only, Rare, taken
 from kcal.errors import InputError, with_extra
 from kcal.files import check_writable
 from kcal.texts import measured_text

@@ -14,8 +14,7 @@ import kcal
 from kcal.cli import console, kinds
 from kcal.cli.console import err, json_asked, out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_and_source
-from kcal.cli.options import Kind, Rare
-from kcal.cli.settings import settings_file, taken
+from kcal.cli.options import Kind, Rare, settings_file, taken
 from kcal.errors import DegenerateError, InputError
 from kcal.files import written_files
 from kcal.texts import one_line

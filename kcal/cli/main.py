@@ -23,17 +23,15 @@ from kcal.cli.exchange import export_command, import_command, schema_command
 from kcal.cli.init import init_command
 from kcal.cli.live import live_command
 from kcal.cli.locate import locate_command
-from kcal.cli.options import Command, declared
+from kcal.cli.options import Command, declared, defaults_of, read_settings
 from kcal.cli.pages import capture_command, mark_command
 from kcal.cli.rectify import rays_command, rectify_command
 from kcal.cli.report import check_command, report_command
 from kcal.cli.rig import app as rig
 from kcal.cli.rig import place_command, station_command
-from kcal.cli.settings import defaults_of, read_settings
-from kcal.cli.show import show_command
+from kcal.cli.show import show_command, view_command
 from kcal.cli.sites import budget_command, sites_command
 from kcal.cli.stars import stars_command
-from kcal.cli.view import view_command
 from kcal.cli.watch import watch_command
 from kcal.errors import KcalError
 from kcal.files import written_files

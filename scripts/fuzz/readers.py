@@ -19,7 +19,7 @@ from kcal.calibrate import load_measured_board, save_measured_board
 from kcal.calibrate.batch.jobs import read_jobs
 from kcal.calibrate.rig.pairs import read_pairs
 from kcal.cli.init import toml_text
-from kcal.cli.settings import read_settings
+from kcal.cli.options import read_settings
 from kcal.corners.images import read_gray, turned_images
 from kcal.corners.video import VideoFrames, read_frames
 from kcal.file_kind import file_kind
