@@ -285,8 +285,9 @@ def test_which_commands_take_a_setting() -> None:
     boards, judging = {"detect", "capture", "board print", "batch"}, {"calibrate", "report", "rig solve"}
     assert {key: takers(found, key) for key in EXAMPLE} == {
         "board": boards, "square": boards, "source": {"capture"}, "require": judging,
-        "site": {"locate", "live"}, "heading": {"locate", "live"}, "baseline": {"calibrate", "report", "budget"},
-        "pixel_sigma": {*judging, "check", "rig check", "mark", "locate", "live", "budget", "station", "sites"},
+        "site": {"locate", "live", "view"}, "heading": {"locate", "live", "view"},
+        "baseline": {"calibrate", "report", "budget"},
+        "pixel_sigma": {*judging, "check", "rig check", "mark", "locate", "live", "budget", "station", "sites", "view"},
     }  # fmt: skip
 
 
