@@ -19,6 +19,8 @@ from kcal.strict_json import MOST_BYTES, read_json
 _HEAD = 65536
 _NATIVE = re.compile(rb'\A\s*\{\s*"kcal"\s*:\s*"(\w{1,40})"')
 _VIDEO = ((4, b"ftyp"), (0, b"\x1aE\xdf\xa3"), (8, b"AVI "), (0, b"\0\0\1\xba"), (0, b"FLV"), (0, b"G@"))
+# ROS 1, MCAP, and SQLite, in which ROS 2 recorded first.
+_BAG = (b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\0")
 # In words, for messages.
 WORDS = {
     "missing": "missing",
@@ -31,6 +33,7 @@ WORDS = {
     "board": "a kcal board file",
     "image": "an image",
     "video": "a video",
+    "bag": "a bag of ROS",
     "marks": "a table of marks",
     "survey": "a table of places",
     "table": "a table without known columns",
@@ -57,7 +60,7 @@ def file_kind(path: str | Path) -> str:
     try:
         about = os.stat(path)
         if stat.S_ISDIR(about.st_mode):
-            return "folder"
+            return "bag" if _is_bag_folder(path) else "folder"
         if not stat.S_ISREG(about.st_mode):
             return "device"
         with open(path, "rb") as file:
@@ -71,7 +74,17 @@ def file_kind(path: str | Path) -> str:
     return _foreign_kind(Path(path), head, about.st_size)
 
 
+def _is_bag_folder(path: str | Path) -> bool:
+    try:
+        with open(os.path.join(path, "metadata.yaml"), "rb") as file:
+            return b"rosbag2_bagfile_information" in file.read(_HEAD)
+    except OSError:
+        return False
+
+
 def _foreign_kind(path: Path, head: bytes, size: int) -> str:
+    if head.startswith(_BAG) and (head[:3] != b"SQL" or path.suffix.lower() == ".db3"):
+        return "bag"
     still = is_heif(head) or head[4:12] == b"ftypcrx "
     if any(head[place:].startswith(mark) for place, mark in _VIDEO) and not still:
         return "video"

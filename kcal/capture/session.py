@@ -21,6 +21,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from torch import Tensor
 
+from kcal.bag import bag_and_topic
 from kcal.calibrate.camera.advice import NextView, board_rolls, far_sigma, next_view, possible_views
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult, calibrate_camera
 from kcal.corners.board import Board
@@ -30,7 +31,7 @@ from kcal.corners.observations import Observations
 from kcal.corners.refine import Refinement
 from kcal.corners.video import NEW, is_new_view, read_frames, sharpest
 from kcal.errors import FileError, InputError, KcalError
-from kcal.files import is_stream, make_folder, read_bytes, source_name, write_atomic
+from kcal.files import is_stream, make_folder, read_bytes, write_atomic
 from kcal.io.images import encode_png
 from kcal.lens.camera import Camera
 from kcal.threads import Handover
@@ -56,17 +57,16 @@ def shots(source: str, stopped: Callable[[], bool], tell: Callable[[str], None])
     Of a video or stream the sharpest of every few frames; of a folder the images that are there and those that come.
 
     Args:
-        source: `camera:0`, `rtsp://...`, a video file, or a folder.
+        source: `camera:0`, `rtsp://...`, a video file, a bag, or a folder.
         stopped: looked at before each frame.
         tell: called with the reason for each image of a folder that cannot be read.
 
     Raises:
         FileError: no such file or folder, no video, or a stream that does not answer.
     """
-    if not is_stream(source) and os.path.isdir(source):
+    if not is_stream(source) and os.path.isdir(source) and bag_and_topic(source) is None:
         yield from _of_folder(Path(source), stopped, tell)
         return
-    name = source_name(source)
     # A live source ends when it is told to.
     frames = sharpest(read_frames(source, float("inf")))
     # Of a stream, frames that come while one is looked at are left out.
@@ -75,7 +75,7 @@ def shots(source: str, stopped: Callable[[], bool], tell: Callable[[str], None])
         for frame in newest or frames:
             if stopped():
                 return
-            yield Shot(f"{name}#{frame.number:06d}", frame.image, True)
+            yield Shot(frame.name(source), frame.image, True)
     finally:
         if newest is not None:
             newest.close(wait=5.0)

@@ -144,6 +144,7 @@ def detect_command(
     time_limit: Annotated[float, Kind(metavar="S", least=0.1)] = 60.0,
     duration: Annotated[float, Kind(metavar="S", least=1.0)] = 120.0,
     keep: Path | None = None,
+    topic: Annotated[list[str], Kind(metavar="TOPIC")] | None = None,
 ) -> None:
     """Find the board in the images of one camera.
 
@@ -161,20 +162,25 @@ def detect_command(
 
     `kcal detect rtsp://10.0.0.7/main --board 9x6 --square 25mm -o left.obs.json --duration 60 --keep frames/`
 
+    `kcal detect run.mcap --topic /left/image_raw --topic /right/image_raw --square 25mm -o rig.obs.json`
+
     `kcal detect "shots/left*.png" --board 9x6 --square 25mm -o left.obs.json --refine opencv`
 
     Args:
-        images: Images of one camera: files, folders or quoted wildcards; or one video, or a stream (rtsp://...,
-            camera:0).
+        images: Images of one camera: files, folders or quoted wildcards; or one video, a bag of ROS (.bag,
+            .mcap, folder), or a stream (rtsp://..., camera:0).
         output: Observations file to write.
         gallery: Images that failed and why, then the views with their corners, worst first.
         coverage: Where in the image corners were seen.
         time_limit: Seconds of processor time after which the search in one image is given up.
         duration: Seconds for which a stream is watched.
         keep: Folder for the frames of a video or stream that became views, as PNG.
+        topic: Of a bag that has images of several. Two, of the cameras of a rig, give two files, NAME_left and
+            NAME_right, with views of the same moments.
     """
     given = given_board(board, square)
 
+    from kcal.bag import bag_and_topic
     from kcal.corners.detect import Detection
     from kcal.corners.images import expand_images, is_video, turned_images
 
@@ -187,15 +193,25 @@ def detect_command(
         raise InputError(f"{streams[0]}: a stream is searched alone, without other images")
     if keep is not None:
         make_folder(keep)
-    if len(images) == 1 and is_video(images[0]):
+    bag = bag_and_topic(images[0]) if len(images) == 1 else None
+    if topic and bag is None:
+        raise InputError("--topic is of one bag: kcal detect run.mcap --topic /left/image_raw ...")
+    if bag is not None and topic:
+        images = [f"{bag[0]}:{one}" for one in topic]
+    if len(topic or ()) > 1 and (gallery or coverage):
+        raise InputError("--gallery and --coverage are of one camera: give one --topic")
+    outputs = _of_each_camera(output, len(images)) if len(topic or ()) > 1 else [output]
+    if bag is not None or (len(images) == 1 and is_video(images[0])):
+        from kcal.corners.video import detect_videos
+
         searched: list[str] = []
         pattern = given or board_in_images(images, square, time_limit)
         with steps(f"watching {streams[0]} for {duration:g} s" if streams else "searching the video", None):
-            observations = kcal.corners.detect_video(
-                images[0], pattern, refine, progress=searched.append, time_limit=time_limit, duration=duration,
+            observed = detect_videos(
+                images, pattern, refine, progress=searched.append, time_limit=time_limit, duration=duration,
                 keep=keep,
             )  # fmt: skip
-        source = f"of {len(searched)} sharp frames (repeats left out)"
+        source = f"of {len(searched)} sharp {'moments' if len(images) > 1 else 'frames'} (repeats left out)"
     else:
         paths = expand_images(images)
         check_writable(output, *paths)
@@ -204,7 +220,7 @@ def detect_command(
             ending_with(lambda error: _next_command(str(error), board, pattern, images, paths, output)),
             steps("detecting", len(paths)) as advance,
         ):
-            observations = kcal.detect(
+            seen = kcal.detect(
                 paths,
                 pattern,
                 refine,
@@ -213,9 +229,11 @@ def detect_command(
                 note=notes.append,
                 on_failure=lambda name, path, found: failed.append((name, path, found)),
             )
+        observed = [seen]
         turned = turned_images([path for path in paths if os.path.isfile(path)])
         source = f"of {len(paths)} images"
-    observations.save(output)
+    for path, observations in zip(outputs, observed, strict=True):
+        observations.save(path)
     if gallery is not None or coverage is not None:
         from kcal.report.calibration import FailedImage, coverage_figure, gallery_figure
 
@@ -225,10 +243,13 @@ def detect_command(
         if coverage is not None:
             kcal.report.save_picture(coverage, coverage_figure(observations))
 
-    width, height = observations.image_size
-    found, unseen = len(observations.views), sum(view.pixels.count(None) for view in observations.views)
-    tell(views=found, failures={failure.name: failure.reason for failure in observations.failures})
-    out.print(f"{output}: board found in {found} {source} of {width}x{height} px")
+    views = [view for one in observed for view in one.views]
+    failures = [failure for one in observed for failure in one.failures]
+    found, unseen = len(views), sum(view.pixels.count(None) for view in views)
+    tell(views=found, failures={failure.name: failure.reason for failure in failures})
+    for path, one in zip(outputs, observed, strict=True):
+        width, height = one.image_size
+        out.print(f"{path}: board found in {len(one.views)} {source} of {width}x{height} px")
     wide, high = (1e3 * side for side in pattern.extent)
     out.print(f"board {pattern}: {wide:g} x {high:g} mm from the first point to the last")
     warn(*notes)
@@ -240,12 +261,18 @@ def detect_command(
     if unseen:
         out.print(f"corners left out as uncertain: {unseen} of {found * pattern.corners}")
     print_left_out(
-        [f"failed {failure.name}: {failure.reason}" for failure in observations.failures],
+        [f"failed {failure.name}: {failure.reason}" for failure in failures],
         output,
-        f"{len(observations.failures)} images failed",
+        f"{len(failures)} images failed",
     )
     if not pattern.unambiguous:
         out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
+
+
+def _of_each_camera(output: Path, count: int) -> list[Path]:
+    name, _, kind = output.name.partition(".")
+    sides = ("left", "right") if count == 2 else map(str, range(1, count + 1))
+    return [check_writable(output.with_name(f"{name}_{side}.{kind}")) for side in sides]
 
 
 def given_board(size: str, square: str | None) -> kcal.Board | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import orjson
 
@@ -12,6 +12,7 @@ import kcal
 from kcal.cli import kinds
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import cameras_and_rig, named_source, picked
+from kcal.cli.options import Kind
 from kcal.errors import InputError
 from kcal.files import write_atomic
 
@@ -29,10 +30,10 @@ def export_command(
 ) -> None:
     """Write a camera or a rig for another program.
 
-    The format follows from the suffix: .yaml and .xml OpenCV, .cameramodel mrcal, .txt and .bin COLMAP, .json
-    nerfstudio, .mat MATLAB, .toml aniposelib, .npz maps for cv2.remap. Others are named by --format. A lens that the
-    format cannot hold is never cut short: the nearest model of the format is fitted, and its error over the image is
-    printed. Pixel origins are converted.
+    The format follows from the suffix: .yaml and .xml OpenCV, .bag, .mcap and .db3 bags of ROS with tf, .cameramodel
+    mrcal, .txt and .bin COLMAP, .json nerfstudio, .mat MATLAB, .toml aniposelib, .npz maps for cv2.remap. Others are
+    named by --format. A lens that the format cannot hold is never cut short: the nearest model of the format is fitted,
+    and its error over the image is printed. Pixel origins are converted.
 
     What is known of a camera goes along as a prior for bundle adjustment: the parameters in the program's order and
     their square-root information, in NAME.prior.json.
@@ -50,7 +51,8 @@ def export_command(
     Args:
         source: Camera or rig of kcal; RIG.json:left is one of its cameras.
         output: File to write.
-        format: opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, gtsam, ceres, numpy or remap.
+        format: opencv, ros, bag, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, gtsam, ceres, numpy or
+            remap.
         model: Lens model of the format to fit, for example opencv5.
         picture: error of a refitted lens over the image.
     """
@@ -101,6 +103,7 @@ def import_command(
     survey_sigma: kinds.Sigma | None = None,
     geoid: kinds.Meters | None = None,
     unit: kinds.Unit | None = None,
+    topic: Annotated[str, Kind(metavar="TOPIC")] | None = None,
 ) -> None:
     """Read a camera or a rig from a file of another program.
 
@@ -116,6 +119,8 @@ def import_command(
 
     `kcal import cameras.txt:2 -o second.camera.json`
 
+    `kcal import run.mcap --topic /left/camera_info -o left.camera.json`
+
     `kcal import corners.vnl --board 10x10 --square 58.8mm --size 6000x3376 -o left.obs.json`
 
     `kcal import places.gpx --survey-sigma 0.02 --geoid -67.3 -o survey.csv`
@@ -123,7 +128,7 @@ def import_command(
     Args:
         sources: File of another program, FILE:NAME for one of its cameras; two files of a pair.
         output: Camera or rig file to write.
-        format: opencv, ros, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, qualisys, agisoft or device.
+        format: opencv, ros, bag, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, qualisys, agisoft or device.
         size: Image size, where the file has none or a wrong one.
         fisheye: Whether four coefficients of OpenCV are a fisheye's.
         board: Read corners instead, of a board with these inner corners.
@@ -131,9 +136,10 @@ def import_command(
         survey_sigma: Of surveyed places, along each axis, where the file has none.
         geoid: Height of the geoid above the WGS84 ellipsoid, added to the elevations of GPX.
         unit: Unit of the translation, where the file has none: mm, cm, m, in.
+        topic: Of a bag of ROS with several cameras: its CameraInfo, or the images.
     """
     named = [named_source(source) for source in sources]
-    paths, camera = [path for path, _ in named], next((name for _, name in named if name), None)
+    paths, camera = [path for path, _ in named], next((name for _, name in named if name), topic)
     what = "corners" if board is not None else "places" if paths[0].suffix.lower() in (".gpx", ".geojson") else ""
     if what and len(paths) > 1:
         raise InputError(f"{what} are read from one file{', with --board and --square' if board is not None else ''}")

@@ -42,6 +42,10 @@ def picked(found: ImportedCameras, name: str | None, source: str) -> kcal.Camera
     if name is not None and name in found.unread:
         raise InputError(f"{source}: camera {name}: {found.unread[name]}")
     names = list(found.names)
+    if name and name.startswith("/"):
+        # A topic of a bag: that of the camera, or of its images.
+        topic = name.strip("/").replace("/", "_") + "_"
+        name = max((one for one in names if topic.startswith(f"{one}_")), key=len, default=name)
     if len(names) == 2 and name in ("left", "right") and name not in names:
         return found.cameras[("left", "right").index(name)]
     if name is None or names.count(name) != 1:
@@ -144,7 +148,7 @@ CALIBRATED_OR_RIG = dataclasses.replace(
 ANY_CAMERA = dataclasses.replace(
     CAMERA,
     words="a file with a camera",
-    kinds=frozenset({"camera", "rig", "foreign", "json", "unknown", "table"}),
+    kinds=frozenset({"camera", "rig", "bag", "foreign", "json", "unknown", "table"}),
 )
 RIG = Wanted(
     "a kcal rig file",
@@ -163,7 +167,7 @@ _STATION = (
     "dem.tif for positions"
 )
 CAMERA_OR_RIG = dataclasses.replace(
-    ANY_CAMERA, words="a camera or rig file", kinds=frozenset({"camera", "rig", "foreign", "json", "unknown"})
+    ANY_CAMERA, words="a camera or rig file", kinds=frozenset({"camera", "rig", "bag", "foreign", "json", "unknown"})
 )
 OBSERVATIONS = Wanted(
     "a kcal observations file",
@@ -196,13 +200,13 @@ SITES = Wanted(
 )
 TABLE = Wanted("a table (CSV)", frozenset({"table", "marks", "survey"}), _MARK)
 IMAGES = Wanted(
-    "an image, a folder of images or a video",
-    frozenset({"image", "folder", "video", "device", "empty", "unknown", "foreign"}),
+    "an image, a folder of images, a video or a bag",
+    frozenset({"image", "folder", "video", "bag", "device", "empty", "unknown", "foreign"}),
     "kcal detect images/ --board 9x6 --square 25mm -o left.obs.json",
     (("observations", _CALIBRATE),),
 )
 VIDEO = dataclasses.replace(
-    IMAGES, words="a video", kinds=frozenset({"video", "device", "unknown", "foreign"}), make="kcal live --help"
+    IMAGES, words="a video", kinds=frozenset({"video", "bag", "device", "unknown", "foreign"}), make="kcal live --help"
 )
 VIEWED = dataclasses.replace(
     OBSERVATIONS,
@@ -211,7 +215,9 @@ VIEWED = dataclasses.replace(
 )
 FOREIGN = Wanted(
     "a file of another program",
-    frozenset({"camera", "rig", "foreign", "json", "image", "unknown", "table", "survey", "marks", "geojson", "gpx"}),
+    frozenset(
+        {"camera", "rig", "bag", "foreign", "json", "image", "unknown", "table", "survey", "marks", "geojson", "gpx"}
+    ),
     "kcal import left.yaml -o left.camera.json",
     (("observations", _CALIBRATE),),
     part=True,
@@ -236,7 +242,9 @@ class _Given(NamedTuple):
     def fits(self, text: str) -> bool:
         """Whether that file would do here."""
         path, name = named_source(text)
-        return self.wanted.part if name else file_kind(path) in self.wanted.kinds or _unseen(text)
+        if name and file_kind(path) != "bag":
+            return self.wanted.part
+        return file_kind(path) in self.wanted.kinds or _unseen(text)
 
 
 def given_texts(value: Any) -> list[str]:
@@ -331,7 +339,7 @@ def _checked_inputs(wanted: Wanted, value: Any) -> list[str]:
     texts = given_texts(value)
     if wanted is not IMAGES or not isinstance(value, list):
         return texts
-    kinds = {text: file_kind(text) for text in texts}
+    kinds = {text: file_kind(named_source(text)[0]) for text in texts}
     fine = [text for text in texts if kinds[text] in wanted.kinds]
     return [text for text in texts if kinds[text] == "missing"] or fine or texts
 

@@ -77,7 +77,8 @@ def live_command(
 
     Args:
         rig: Rig file from `kcal rig`.
-        videos: Video files or addresses (rtsp://...), with --detector: one for each camera, in the rig's order.
+        videos: Video files, bags (run.mcap:/left/image_raw) or addresses (rtsp://...), with --detector: one for each
+            camera, in the rig's order.
         output: File that grows: .geojsonl, .csv or .cot; may be repeated.
         detector: Called with each image, uint8 (H, W, 3) in the order red, green, blue; returns boxes in pixels.
         detections: In place of videos: lines of JSON, one for each moment; - for the standard input.

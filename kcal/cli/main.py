@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +18,7 @@ from kcal.cli.board import app as board
 from kcal.cli.board import detect_command
 from kcal.cli.calibrate import batch_command, calibrate_command
 from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
-from kcal.cli.console import err, print_label, print_replaced, working
+from kcal.cli.console import err, print_label, print_replaced, warn, working
 from kcal.cli.demo import demo_command
 from kcal.cli.exchange import export_command, import_command, schema_command
 from kcal.cli.init import init_command
@@ -33,7 +34,7 @@ from kcal.cli.show import show_command, view_command
 from kcal.cli.sites import budget_command, sites_command
 from kcal.cli.stars import stars_command
 from kcal.cli.watch import watch_command
-from kcal.errors import KcalError
+from kcal.errors import KcalError, KcalWarning
 from kcal.files import written_files
 from kcal.interrupts import only_interruptions
 from kcal.texts import visible
@@ -128,6 +129,10 @@ app.add_typer(rig, name="rig")
 
 def main() -> None:
     """Run the command line; an error of kcal is one line on the error stream and exit code 1."""
+    shown = warnings.showwarning
+    warnings.showwarning = lambda message, kind, *where: (
+        warn(str(message)) if issubclass(kind, KcalWarning) else shown(message, kind, *where)
+    )
     try:
         app()
     except KcalError as error:

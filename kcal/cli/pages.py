@@ -139,7 +139,7 @@ def capture_command(
     `kcal capture incoming/ --board 9x6 --square 25mm -o left.obs.json --until 0.05`
 
     Args:
-        source: camera:0, a stream (rtsp://...), a video, or a folder into which images come.
+        source: camera:0, a stream (rtsp://...), a video, a bag, or a folder into which images come.
         output: Observations file to write, or to continue.
         until: Stop when points at infinity are known to this σ, on average over the image.
         most: Stop at this number of views.

@@ -58,10 +58,12 @@ def convert_images(
     Returns:
         how many were done before, and what was wrong with those that failed.
     """
+    from kcal.corners.images import image_bytes
+
     before, failures, view = 0, list[str](), _view_key(module)
     for path, target in zip(paths, targets, strict=True):
         try:
-            data = read_bytes(path)
+            data = image_bytes(path)
             note = f"kcal rectify {hashlib.sha256(view.encode() + data).hexdigest()}"
             if target.exists() and note.encode() in read_bytes(target)[:_HEAD]:
                 before += 1

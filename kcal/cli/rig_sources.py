@@ -176,6 +176,7 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     Raises:
         InputError: nothing tells a length, or images without partners or with too little in common.
     """
+    from kcal.calibrate.rig.pairs import image_pairs
     from kcal.corners.images import expand_images, read_gray
     from kcal.scene.match import match_scene, scene_of
 
@@ -187,21 +188,17 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
             "the images the same. Add --baseline, --landmarks, --positions or boards (--pairs)"
         )
     given = [*images_by_camera("--scene", words, list(read.cameras)).values()]
-    files = [{path.name: path for path in expand_images(list(one))} for one in given]
-    named = [list(own) for own in files]
-    chosen = [(named[0][0], named[1][0])] if len(named[0]) == len(named[1]) == 1 else kcal.rig.pair_by_name(*named)
-    if not chosen:
-        raise InputError(f"--scene: no image of {given[0][0]} belongs to one of {given[1][0]}; name pairs alike")
+    chosen = image_pairs(*given)
     pairs, found, refused = [], [], list[str]()
     with steps("matching the scene", len(chosen)) as advance:
         for left, right in chosen:
-            pair = kcal.rig.ImagePair(left, read_gray(files[0][left]), read_gray(files[1][right]))
+            pair = kcal.rig.ImagePair(left.name, read_gray(left), read_gray(right))
             try:
                 found.append(match_scene((first, second), pair))
                 pairs.append(pair)
             except InputError as error:
                 refused.append(str(error))
-            advance(left)
+            advance(left.name)
     if not pairs:
         raise InputError(f"--scene: {refused[0]}")
     warn(*(f"{text}; left out" for text in refused))
@@ -212,8 +209,7 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
         for one in counts
     ]
     read.notes += aligned(rows)
-    alone = len(named[0]) + len(named[1]) - 2 * len(chosen)
-    if alone:
+    if alone := sum(len(expand_images(one)) for one in given) - 2 * len(chosen):
         read.notes.append(f"{alone} images of the scene without partner")
     if len(pairs) == 1:
         read.notes.append("one pair: what moves cannot be told from what stands still; give pairs of several times")

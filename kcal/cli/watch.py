@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import kcal
+from kcal.bag import bag_and_topic
 from kcal.cli import kinds
 from kcal.cli.console import err, on_signals, out, print_wrote, steps, warn
 from kcal.cli.options import Kind
@@ -66,7 +67,8 @@ def watch_command(
 
     Args:
         rig: Rig file from `kcal rig`.
-        images: Folders of images, videos or addresses (rtsp://...), LEFT RIGHT; without them the history is shown.
+        images: Folders of images, videos, bags (run.mcap:/left/image_raw) or addresses (rtsp://...), LEFT RIGHT;
+            without them the history is shown.
         output: CSV file that grows, the history: a row for each measurement.
         every: Seconds between measurements.
         reference_images: Images of when the rig was solved; else the first ones count.
@@ -134,7 +136,7 @@ def watch_command(
 def _follow(watcher: Watcher, rig: kcal.Rig, sources: tuple[str, str], hooks: list[Webhook], *, ends: bool) -> None:
     """Look until the sources end, it is stopped, or an alarm ends it."""
     frames, stopped = None, False
-    if not Path(sources[0]).is_dir():
+    if not Path(sources[0]).is_dir() or bag_and_topic(sources[0]) is not None:
         with with_extra("video", "videos need"):
             from kcal.pipeline.video_source import FramesTogether
 
@@ -176,18 +178,15 @@ def _of_frames(watcher: Watcher, frames: FramesTogether) -> Iterator[tuple[float
 
 
 def _folder_pairs(watcher: Watcher, folders: tuple[str, str]) -> Iterator[tuple[float, Gray, Gray]]:
-    from kcal.corners.images import expand_images, image_time, read_gray
+    from kcal.calibrate.rig.pairs import image_pairs
+    from kcal.corners.images import image_time, read_gray
 
-    files = [{path.name: path for path in expand_images([folder])} for folder in folders]
-    pairs = kcal.rig.pair_by_name(*(list(own) for own in files))
-    if not pairs:
-        raise InputError(f"no image of {folders[0]} belongs to one of {folders[1]}; name pairs alike")
-    timed = sorted((image_time(files[0][left]), left, right) for left, right in pairs)
+    timed = sorted((image_time(left), left, right) for left, right in image_pairs(*([folder] for folder in folders)))
     with steps("watching", len(timed)) as advance:
         for time, left, right in timed:
             if watcher.due(time):
-                yield time, read_gray(files[0][left]), read_gray(files[1][right])
-            advance(left)
+                yield time, read_gray(left), read_gray(right)
+            advance(left.name)
 
 
 def _turn_text(noticed: Noticed) -> str:

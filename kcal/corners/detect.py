@@ -18,10 +18,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal.bag import bag_and_topic
 from kcal.corners.board import Board
 from kcal.corners.circles import find_circles, refine_circles, wrong_size
 from kcal.corners.grid import MIN_SHARPNESS, local_side, sharpness
-from kcal.corners.images import Gray, decode_gray, expand_images, image_header, is_video, to_8bit, unique_names
+from kcal.corners.images import (
+    Gray,
+    decode_gray,
+    expand_images,
+    image_bytes,
+    image_header,
+    is_video,
+    to_8bit,
+    unique_names,
+)
 from kcal.corners.marker_boards import MIN_CORNERS, enough, find_aprilgrid, find_charuco, free_side
 from kcal.corners.observations import Failure, Observations, View, common_size, rescaled
 from kcal.corners.recognize import (
@@ -39,7 +49,7 @@ from kcal.corners.saddle import CornerStatus, Refined
 from kcal.corners.search import SEARCH_SIDES, find_board, reduced, refine_through_sizes
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
-from kcal.files import read_bytes, source_name
+from kcal.files import source_name
 from kcal.opencv import cv2
 from kcal.texts import briefly
 
@@ -504,7 +514,7 @@ def _files_and_images(paths: Any) -> list[Any]:
                     "example cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)"
                 )
             found.append(one)
-        elif os.path.isdir(one) or (glob.has_magic(str(one)) and not os.path.exists(one)):
+        elif os.path.isdir(one) or bag_and_topic(one) or (glob.has_magic(str(one)) and not os.path.exists(one)):
             found += expand_images([one])
         else:
             found.append(Path(one))
@@ -517,7 +527,7 @@ def image_and_hash(source: Any) -> tuple[Any, str | None]:
     """An image, and the hash of its file's bytes if it comes from one."""
     if not isinstance(source, Path):
         return as_image(source), None
-    data = read_bytes(source)
+    data = image_bytes(source)
     return decode_gray(data, source), hashlib.sha256(data).hexdigest()
 
 
@@ -580,7 +590,7 @@ def size_of(file: Any) -> tuple[int, int] | None:
     if not isinstance(file, Path):
         return _size(file)
     try:
-        width, height = image_header(read_bytes(file), file)
+        width, height = image_header(image_bytes(file), file)
         return (width, height) if width else _size(image_and_hash(file)[0])
     except FileError:
         return None

@@ -30,6 +30,7 @@ import numpy.typing as npt
 from PIL import ExifTags, Image, UnidentifiedImageError
 from PIL.JpegImagePlugin import JpegImageFile
 
+from kcal.bag import bag_and_topic, name_of, open_bag, stamp_in
 from kcal.errors import FileError, InputError
 from kcal.file_kind import check_image_header, check_pixel_count, is_heif
 from kcal.files import is_stream, read_bytes, read_head
@@ -103,7 +104,81 @@ def read_gray(path: str | Path) -> Gray:
         >>> image.dtype, image.shape
         (dtype('uint16'), (256, 256))
     """
-    return decode_gray(read_bytes(path), path)
+    return decode_gray(image_bytes(path), path)
+
+
+def image_bytes(path: str | Path) -> bytes:
+    """The bytes of an image file, or of an image in a bag as such a file.
+
+    Raises:
+        FileError: missing or damaged, or pixels of a kind that kcal does not read.
+    """
+    bag = bag_and_topic(Path(path).parent) if (stamp := stamp_in(path)) is not None else None
+    if bag is None or stamp is None:
+        return read_bytes(path)
+    return _as_file(open_bag(bag[0]).image(bag[1], stamp), path)
+
+
+def bag_images(source: str | Path) -> list[Path] | None:
+    """The images of a bag's topic in the order of their stamps, by which they are named; None if it is no bag.
+
+    Raises:
+        FileError: it cannot be read.
+        InputError: no such topic, or several and none is named.
+    """
+    if (found := bag_and_topic(source)) is None:
+        return None
+    bag = open_bag(found[0])
+    topic = bag.image_topic(found[1])
+    return [Path(f"{found[0]}:{topic}", name_of(stamp)) for stamp in bag.stamps(topic)]
+
+
+# Pixels of `sensor_msgs/Image` by their encoding: bytes of a sample, samples, and how OpenCV makes colors of them.
+_PIXELS: dict[str, tuple[int, int, int | None]] = {
+    f"{name}{8 * size}": (size, samples, convert)
+    for size in (1, 2)
+    for name, samples, convert in (
+        ("mono", 1, None), ("rgb", 3, None), ("bgr", 3, cv2.COLOR_BGR2RGB),
+        ("rgba", 4, cv2.COLOR_RGBA2RGB), ("bgra", 4, cv2.COLOR_BGRA2RGB),
+        ("bayer_rggb", 1, cv2.COLOR_BayerRGGB2RGB), ("bayer_bggr", 1, cv2.COLOR_BayerBGGR2RGB),
+        ("bayer_gbrg", 1, cv2.COLOR_BayerGBRG2RGB), ("bayer_grbg", 1, cv2.COLOR_BayerGRBG2RGB),
+    )
+}  # fmt: skip
+_PIXELS |= {
+    "8UC1": _PIXELS["mono8"], "8UC3": _PIXELS["bgr8"], "8UC4": _PIXELS["bgra8"], "16UC1": _PIXELS["mono16"],
+    **dict.fromkeys(("yuv422", "uyvy"), (1, 2, cv2.COLOR_YUV2RGB_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (1, 2, cv2.COLOR_YUV2RGB_YUY2)),
+}  # fmt: skip
+
+
+def _as_file(message: Any, source: str | Path) -> bytes:
+    """The file of an image message: the one in it, or PGM or PPM of its pixels."""
+    data = np.ascontiguousarray(message.data, np.uint8)
+    compressed = getattr(message, "format", None)
+    encoding = message.encoding if compressed is None else compressed.partition(";")[0].strip()
+    if compressed is not None:
+        if "compresseddepth" in compressed.lower() or not re.search("jpe?g|png", compressed.lower()):
+            raise FileError(f"{source}: an image in the format {compressed!r}; kcal reads jpeg and png")
+        # image_transport compresses a mosaic of colors as if it were gray.
+        if not encoding.startswith("bayer_"):
+            return data.tobytes()
+    if encoding not in _PIXELS:
+        raise FileError(f"{source}: pixels in the encoding {encoding!r}; kcal reads {', '.join(_PIXELS)}")
+    size, samples, convert = _PIXELS[encoding]
+    if compressed is not None:
+        pixels = _decoded(data.tobytes(), source, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    else:
+        height, width, step, row = message.height, message.width, message.step, message.width * size * samples
+        # Some drivers leave out what fills the last row.
+        if not (0 < row <= step and height > 0 and (height - 1) * step + row <= data.size):
+            raise FileError(f"{source}: {width}x{height} px in rows of {step} bytes do not fit {data.size} bytes")
+        rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1))
+        stored = np.ascontiguousarray(rows).view(f"{'>' if message.is_bigendian else '<'}u{size}")
+        pixels = stored.astype(f"u{size}").reshape(height, width, samples)
+    shown = pixels if convert is None else cv2.cvtColor(pixels, convert)
+    height, width, colors = (*shown.shape, 1)[:3]
+    head = f"P{6 if colors == 3 else 5} {width} {height} {255 if shown.dtype == np.uint8 else 65535}\n"
+    return head.encode() + shown.astype(shown.dtype.newbyteorder(">")).tobytes()
 
 
 def to_8bit(image: Gray) -> npt.NDArray[np.uint8]:
@@ -135,7 +210,8 @@ def expand_images(inputs: str | Path | Sequence[str | Path]) -> list[Path]:
 
     A folder stands for the images directly inside it (by suffix), a wildcard for the files it matches; both in natural
     order (`2.jpg` before `10.jpg`). HEIC and raw images of cameras are among them unless the folder has the same image
-    in another format: what cannot be read is told with what to do.
+    in another format: what cannot be read is told with what to do. A bag, or `run.mcap:/left/image_raw`, stands for the
+    images of its topic.
 
     Raises:
         InputError: no input at all.
@@ -177,6 +253,8 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _expand_one(path: Path) -> list[Path]:
+    if (images := bag_images(path)) is not None:
+        return images
     # Unlike Path's, these say no where a name is too long.
     if os.path.isdir(path):
         inside = [file for file in path.iterdir() if not file.name.startswith(".") and file.is_file()]

@@ -8,7 +8,7 @@ import io
 import json
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,14 +92,14 @@ def read_ros(path: Path, hints: Hints) -> ImportedCameras:
     """Read a camera, and how it is rectified: YAML, echoed messages, or the calibrator's text, `ost.txt`."""
     text = read_text(path, MOST_BYTES)
     if ROS_TEXT.search(text):
-        return _ros_camera(_sections(text), path.stem, hints)
+        return ros_camera(_sections(text), path.stem, hints)
     # Messages of one camera differ in their times alone.
     timeless = re.sub(r"\A\s*%YAML:.*|^[ \t]*(?:seq|n?secs?|nanosec): .*", "", text, flags=re.MULTILINE)
     parts = list(dict.fromkeys(part.strip() for part in re.split(r"^---[ \t]*$", timeless, flags=re.MULTILINE)))
     contents = [read_yaml(part, str(path)) for part in parts if part]
     if len(contents) == 1:
-        return _ros_camera(contents[0], path.stem, hints)
-    found = [_ros_camera(each, str(each["header"]["frame_id"]), hints) for each in contents]
+        return ros_camera(contents[0], path.stem, hints)
+    found = [ros_camera(each, str(each["header"]["frame_id"]), hints) for each in contents]
     names = [camera_name(each.cameras[0], "") for each in found]
     if twice := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"messages of {twice[0]} differ: leave those of one calibration in the file")
@@ -111,7 +111,8 @@ def read_ros(path: Path, hints: Hints) -> ImportedCameras:
     )
 
 
-def _ros_camera(content: Mapping[str, Any], name: str, hints: Hints) -> ImportedCameras:
+def ros_camera(content: Mapping[str, Any], name: str, hints: Hints) -> ImportedCameras:
+    """The camera of the values of a file of ROS, or of a message, and how it is rectified."""
     found = read_keyed(content, str(content.get("camera_name") or name), hints, "ros")
     turn, projected = (
         flat(content.get(long, content.get(short, content.get(short.lower()))))
@@ -153,36 +154,36 @@ def _sections(text: str) -> dict[str, Any]:
 
 def write_ros(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
     """Write a file for each camera; two with poses are rectified as by `cv2.stereoRectify`."""
-    rectified = [(np.eye(3), _projection(camera)) for camera in cameras]
-    if len(cameras) == 2 and poses:
-        rectified = _rectify(ImportedCameras(format="ros", cameras=tuple(cameras), poses=tuple(poses)))
     paths = paths_for(path, len(cameras))
-    for camera, (rotation, projection), target in zip(cameras, rectified, paths, strict=True):
-        kind = (
-            "equidistant" if camera.model.fisheye else "rational_polynomial" if camera.model.size > 5 else "plumb_bob"
-        )
-        lens = camera.coefficients.tolist()
-        lens += [0.0] * (5 - len(lens)) if kind == "plumb_bob" else []
+    for (size, kind, matrices), camera, target in zip(ros_values(cameras, poses), cameras, paths, strict=True):
+        blocks = [{"rows": len(one), "cols": one.shape[1], "data": one.ravel().tolist()} for one in matrices]
         content: dict[str, Any] = {
-            "image_width": camera.size[0],
-            "image_height": camera.size[1],
+            "image_width": size[0],
+            "image_height": size[1],
             "camera_name": camera_name(camera, target.stem),
-            "camera_matrix": _matrix_block(np.array(plain(camera.matrix))),
+            "camera_matrix": blocks[0],
             "distortion_model": kind,
-            "distortion_coefficients": _matrix_block(np.array([lens])),
-            "rectification_matrix": _matrix_block(rotation),
-            "projection_matrix": _matrix_block(projection),
+            "distortion_coefficients": blocks[1],
+            "rectification_matrix": blocks[2],
+            "projection_matrix": blocks[3],
         }
         write_atomic(target, dump_yaml(content))
     return paths
 
 
-def _projection(camera: Camera) -> np.ndarray:
-    return np.pad(np.array(plain(camera.matrix)), ((0, 0), (0, 1)))
-
-
-def _matrix_block(values: np.ndarray) -> dict[str, Any]:
-    return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
+def ros_values(
+    cameras: Sequence[Camera], poses: Sequence[Pose]
+) -> Iterator[tuple[tuple[int, int], str, list[np.ndarray]]]:
+    """Size, name of the lens model, and K, D (1, N), R and P of each camera; two with poses are rectified."""
+    matrices = [np.array(plain(camera.matrix)) for camera in cameras]
+    rectified = [(np.eye(3), np.pad(matrix, ((0, 0), (0, 1)))) for matrix in matrices]
+    if len(cameras) == 2 and poses:
+        rectified = _rectify(ImportedCameras(format="ros", cameras=tuple(cameras), poses=tuple(poses)))
+    for camera, matrix, turned in zip(cameras, matrices, rectified, strict=True):
+        lens = camera.coefficients.tolist()
+        kind = "equidistant" if camera.model.fisheye else "rational_polynomial" if len(lens) > 5 else "plumb_bob"
+        lens += [0.0] * (5 - len(lens)) if kind == "plumb_bob" else []
+        yield camera.size, kind, [matrix, np.array([lens]), *turned]
 
 
 def _rectify(pair: ImportedCameras) -> list[tuple[np.ndarray, np.ndarray]]:

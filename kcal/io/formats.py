@@ -13,9 +13,10 @@ from typing import Any
 import torch
 
 from kcal.errors import FileError, InputError
-from kcal.file_kind import is_image
+from kcal.file_kind import file_kind, is_image
 from kcal.files import read_bytes, read_head, read_text
 from kcal.io import (
+    format_bag,
     format_devices,
     format_kalibr,
     format_mrcal,
@@ -98,6 +99,14 @@ FORMATS = {
         models=("pinhole", "opencv4", "opencv5", "opencv8", "fisheye4"),
         read=format_opencv.read_ros,
         write=format_opencv.write_ros,
+    ),
+    "bag": CameraFormat(
+        title="ROS bag with camera_info and tf",
+        suffixes=(".bag", ".mcap", ".db3"),
+        models=("pinhole", "opencv4", "opencv5", "opencv8", "fisheye4"),
+        read=format_bag.read_bag,
+        write=format_bag.write_bag,
+        poses=_ANY,
     ),
     "kalibr": CameraFormat(
         title="Kalibr camchain",
@@ -214,6 +223,8 @@ def recognized(path: Path) -> str:
         FileError: it cannot be read, or is of no known format.
     """
     suffix = (path.with_suffix("") if path.suffix.lower() == ".gz" else path).suffix.lower()
+    if file_kind(path) == "bag":
+        return "bag"
     read_head(path, 0)
     if suffix in (".mat", ".cameramodel", ".bin"):
         return {".mat": "matlab", ".cameramodel": "mrcal", ".bin": "colmap"}[suffix]
@@ -294,9 +305,9 @@ def import_cameras(
 ) -> ImportedCameras:
     """Read cameras, and how they stand to each other, from files of other programs or of kcal.
 
-    OpenCV (YAML, XML; fisheye and omnidir, too), ROS camera_info, Kalibr camchains and results, mrcal, COLMAP,
-    nerfstudio, MATLAB structs, OpenSfM, TOML of aniposelib, pose2sim and Caliscope, Qualisys, Agisoft Metashape, and
-    kcal's priors for other programs. Error bars come with a camera where its file has them.
+    OpenCV (YAML, XML; fisheye and omnidir, too), ROS camera_info and bags with it, Kalibr camchains and results, mrcal,
+    COLMAP, nerfstudio, MATLAB structs, OpenSfM, TOML of aniposelib, pose2sim and Caliscope, Qualisys, Agisoft
+    Metashape, and kcal's priors for other programs. Error bars come with a camera where its file has them.
     Principal points are converted to kcal's convention: (0, 0) is the center of the first pixel.
 
     Args:

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from kcal.calibrate.rig.pairs import pair_by_name
-from kcal.corners.images import Gray, decode_image, expand_images, is_video, read_gray
+from kcal.calibrate.rig.pairs import image_pairs
+from kcal.corners.images import Gray, decode_image, image_bytes, is_video, read_gray
 from kcal.corners.match import MatchOptions, MatchStatus, find_again, match_points
 from kcal.corners.video import VideoFrames
 from kcal.errors import InputError
-from kcal.files import read_bytes
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.projection import FAR, project_components
 from kcal.lens.rig import Rig
@@ -244,7 +243,7 @@ class _Files:
         return read_gray(self._paths[number])
 
     def stored(self, number: int) -> Gray:
-        return decode_image(read_bytes(self._paths[number]), self._paths[number])
+        return decode_image(image_bytes(self._paths[number]), self._paths[number])
 
 
 class Pyramid:
@@ -359,7 +358,7 @@ class Pictures:
 
 
 def open_pictures(left: Path, right: Path) -> Pictures:
-    """Images, folders of images that are paired by name, or two videos that are paired by frame.
+    """Images, folders or bags, whose images are paired by name, or two videos that are paired by frame.
 
     Raises:
         FileError: nothing there, or nothing that can be read.
@@ -376,15 +375,8 @@ def open_pictures(left: Path, right: Path) -> Pictures:
                 "one moment; convert one of them"
             )
         return Pictures([f"#{n:06d}" for n in range(min(first.count, second.count))], first, second)
-    lefts, rights = expand_images([left]), expand_images([right])
-    if len(lefts) == len(rights) == 1:
-        names, pairs = [lefts[0].stem], [(0, 0)]
-    else:
-        by_name = [{path.name: i for i, path in enumerate(paths)} for paths in (lefts, rights)]
-        found = pair_by_name(list(by_name[0]), list(by_name[1]))
-        pairs = [(by_name[0][a], by_name[1][b]) for a, b in found]
-        names = [Path(a).stem for a, _ in found]
-    return Pictures(names, _Files(tuple(lefts[i] for i, _ in pairs)), _Files(tuple(rights[i] for _, i in pairs)))
+    lefts, rights = zip(*image_pairs([left], [right]), strict=True)
+    return Pictures([path.stem for path in lefts], _Files(lefts), _Files(rights))
 
 
 # Find the points of an earlier session again in new images, for the operator to confirm.

@@ -21,6 +21,8 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kcal.bag import stamp_in
+from kcal.corners.images import bag_images, decode_image, image_bytes, to_8bit
 from kcal.errors import FileError, InputError
 from kcal.files import is_stream, source_name
 from kcal.lens.rig import Rig
@@ -86,7 +88,8 @@ def file_frames(
     """The frames of a file in the order of their times, in the orientation in which the sensor wrote them.
 
     Args:
-        path: any container with times: MP4, MOV, MKV, AVI, MPEG-TS.
+        path: any container with times: MP4, MOV, MKV, AVI, MPEG-TS; or a bag (`run.mcap:/left/image_raw`), whose times
+            are Unix seconds.
         size: (width, height) of the camera's images.
         since: seconds of the first frame that is wanted; some frames before it come too.
         undecoded: called for each frame that is damaged or not later than the one before; it is left out.
@@ -95,17 +98,35 @@ def file_frames(
     Raises:
         FileError: no such file, no video, one without times, no frame that can be decoded, or frames of another size.
     """
-    if since > 0:
+    images = bag_images(path)
+    if since > 0 and images is None:
         with contextlib.closing(_wound(path, size, since, lambda: None, lambda _: None)) as frames:
             first = next(frames, None)
         # Where winding overshoots, the whole file is decoded.
         since = since if first is not None and first.time <= since else 0.0
     count = 0
-    for frame in _wound(path, size, since, undecoded, tell):
+    wound = _wound(path, size, since, undecoded, tell)
+    for frame in wound if images is None else _of_bag(images, size, since, undecoded):
         count += 1
         yield frame
     if not count:
         raise FileError(f"{path}: no frame can be decoded")
+
+
+def _of_bag(
+    images: Iterable[Path], size: tuple[int, int], since: float, undecoded: Callable[[], None]
+) -> Iterator[TimedFrame]:
+    for path in images:
+        if (time := 1e-9 * (stamp_in(path) or 0)) >= since:
+            try:
+                image = to_8bit(decode_image(image_bytes(path), path))
+            except FileError:
+                undecoded()
+                continue
+            kind = "gray" if image.ndim == 2 else "rgb24" if image.shape[2] == 3 else "rgba"
+            picture = av.VideoFrame.from_ndarray(image, format=kind)
+            check_size(picture, size, str(path))
+            yield TimedFrame(time, picture)
 
 
 def _wound(

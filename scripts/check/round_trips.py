@@ -100,6 +100,35 @@ def by_ceres(path: Path, points: np.ndarray) -> np.ndarray:
     return opencv_formula(points, matrix, values[4:], False)
 
 
+def by_rosbags(path: Path, points: np.ndarray) -> np.ndarray:
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_typestore
+
+    with Reader(path) as bag:
+        ((_, _, data),) = bag.messages()
+    info: Any = get_typestore(Stores.LATEST).deserialize_cdr(data, "sensor_msgs/msg/CameraInfo")
+    return opencv_formula(points, info.k.reshape(3, 3), info.d, info.distortion_model == "equidistant")
+
+
+def bag_of_rosbags(folder: Path) -> Path:
+    """A bag of ROS 1 with the camera K, D, as a driver publishes it."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, kind = get_typestore(Stores.ROS1_NOETIC), "sensor_msgs/msg/CameraInfo"
+    types = store.types
+    time = types["builtin_interfaces/msg/Time"](sec=1, nanosec=0)
+    info = types[kind](
+        header=types["std_msgs/msg/Header"](seq=0, stamp=time, frame_id="camera"), height=SIZE[1], width=SIZE[0],
+        distortion_model="plumb_bob", D=D, K=K.ravel(), R=np.eye(3).ravel(), P=np.pad(K, ((0, 0), (0, 1))).ravel(),
+        binning_x=0, binning_y=0,
+        roi=types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
+    )  # fmt: skip
+    with Writer(folder / "driver.bag") as bag:
+        bag.write(bag.add_connection("/camera_info", kind, typestore=store), 10**9, store.serialize_ros1(info, kind))
+    return folder / "driver.bag"
+
+
 def by_aniposelib(path: Path, points: np.ndarray) -> np.ndarray:
     from aniposelib.cameras import CameraGroup  # type: ignore[import-not-found, unused-ignore]
 
@@ -117,6 +146,7 @@ def out_rows(folder: Path, mrcal: str | None) -> Iterator[Row]:
         "gtsam": ("g.json", "gtsam", by_gtsam),
         "ceres": ("ceres.json", "json, cv2.projectPoints", by_ceres),
         "numpy": ("n.npz", "numpy, cv2.projectPoints", by_numpy),
+        "bag": ("calibration.mcap", "rosbags, cv2.projectPoints", by_rosbags),
         "toml": ("anipose.toml", "aniposelib", by_aniposelib),
     }
     if mrcal:
@@ -191,6 +221,8 @@ def in_files(folder: Path, mrcal: str | None) -> Iterator[Given]:
     }
     savemat(folder / "in.mat", {"cameraParams": cells, "estimationErrors": {"IntrinsicsErrors": errors}})
     yield "matlab", "opencv5", folder / "in.mat", SIGMA, "SciPy", lambda p: opencv_formula(p, K, D, False)
+    bag = bag_of_rosbags(folder)
+    yield "bag", "plumb_bob", bag, None, "rosbags, cv2.projectPoints", lambda p: opencv_formula(p, K, D, False)
     yield "agisoft", "frame", *agisoft(folder)
     qualisys = folder / "q.qca.txt"
     order = ("radial", 1), ("radial", 2), ("tangental", 1), ("tangental", 2), ("radial", 3)

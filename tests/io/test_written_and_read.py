@@ -23,6 +23,7 @@ SUFFIXES = {
     "toml": (".toml",),
     **dict.fromkeys(("nerfstudio", "opensfm", "gtsam", "ceres"), (".json",)),
     "numpy": (".npz",),
+    "bag": (".bag", ".mcap", ".db3"),
     **dict.fromkeys(("ros", "kalibr"), (".yaml",)),
 }
 

@@ -21,7 +21,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibratio
 from kcal.calibrate.camera.result import HYBRID
 from kcal.corners.board import Board
 from kcal.corners.detect import detect_board, recognize_board, refuse_other_board, view_of
-from kcal.corners.images import decode_gray, expand_images, unique_names
+from kcal.corners.images import decode_gray, expand_images, image_bytes, unique_names
 from kcal.corners.observations import Failure, Observations, PackedCovariance, Pixel, View, common_size, rescaled
 from kcal.corners.refine import Refinement
 from kcal.errors import FileError, InputError, KcalError
@@ -187,7 +187,7 @@ def detect_image(path: str, board: Board, options: BatchOptions) -> Detected:
     """Find the board in one image."""
     with work_limit(options.time_limit):
         try:
-            image = decode_gray(read_bytes(path), path)
+            image = decode_gray(image_bytes(path), path)
         except FileError as error:
             return Detected(reason=str(error).removeprefix(f"{path}: "))
         found = detect_board(image, board, options.refine)

@@ -42,6 +42,7 @@ from kcal.calibrate.batch.jobs import (
 )
 from kcal.calibrate.camera.calibrate import ALONE, sharing
 from kcal.calibrate.camera.result import HYBRID, CameraCalibrationResult
+from kcal.corners.images import image_bytes
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError, KcalError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
@@ -172,7 +173,7 @@ class Results:
         board = self.jobs[number].board
         assert board is not None
         try:
-            digest = hashlib.sha256(read_bytes(path)).hexdigest()
+            digest = hashlib.sha256(image_bytes(path)).hexdigest()
         except FileError as error:
             yield from self._detected(number, i, Detected(reason=str(error).removeprefix(f"{path}: ")))
             return

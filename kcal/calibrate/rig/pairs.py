@@ -14,12 +14,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.bag import pair_stamps, stamp_in
 from kcal.calibrate.problem.poses import poses_under, refine_poses
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import Views
 from kcal.calibrate.rig.boards import Boards
 from kcal.calibrate.rig.sources import RigData
 from kcal.corners.board import Board
+from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
@@ -35,7 +37,8 @@ _SIDE = re.compile(r"(?<![a-z])(left|right|l|r|cam(?:era)?[ _-]?[0-9]+)(?![a-z])
 def pair_by_name(left: Sequence[str], right: Sequence[str]) -> list[Pair]:
     """Pair views whose names differ only in the camera's word, or whose last number is the same.
 
-    Three rules are tried, and the first that pairs anything without a doubt is used for all: equal names without
+    Images of bags, which are named by their stamps, pair by these, at most 10 ms apart. Else three rules are tried, and
+    the first that pairs anything without a doubt is used for all: equal names without
     folder and suffix; equal after removing `left`, `right`, `l`, `r`, `cam0`, `camera1` and the like; equal last
     number.
 
@@ -53,6 +56,9 @@ def pair_by_name(left: Sequence[str], right: Sequence[str]) -> list[Pair]:
         >>> pair_by_name(["left01.jpg", "left02.jpg"], ["right02.jpg", "right03.jpg"])
         [('left02.jpg', 'right02.jpg')]
     """
+    stamps = [{stamp: name for name in names if (stamp := stamp_in(name))} for names in (left, right)]
+    if len(stamps[0]) == len(left) > 0 and len(stamps[1]) == len(right) > 0:
+        return [(stamps[0][one], stamps[1][other]) for one, other in pair_stamps(*map(sorted, stamps))]
     doubt = None
     for key in (_stem, _without_side, _last_number):
         lefts, rights = _by_key(left, key), _by_key(right, key)
@@ -70,6 +76,19 @@ def pair_by_name(left: Sequence[str], right: Sequence[str]) -> list[Pair]:
         f"no view of the left camera ({left[0] if left else 'none'}, ...) has a partner by name among the right "
         f"camera's ({right[0] if right else 'none'}, ...); give a CSV of pairs"
     )
+
+
+def image_pairs(left: Sequence[str | Path], right: Sequence[str | Path]) -> list[tuple[Path, Path]]:
+    """Image files that belong together: two images, or those of folders, wildcards or bags, which `pair_by_name` pairs.
+
+    Raises:
+        FileError: nothing there.
+        InputError: names that cannot be paired.
+    """
+    first, second = ({path.name: path for path in expand_images(given)} for given in (left, right))
+    if len(first) == len(second) == 1:
+        return [*zip(first.values(), second.values(), strict=True)]
+    return [(first[one], second[other]) for one, other in pair_by_name([*first], [*second])]
 
 
 def names_by_side(names: Sequence[str]) -> dict[str, dict[str, str]]:
