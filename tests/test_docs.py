@@ -232,3 +232,11 @@ def test_how_often_intervals_are_right_is_one_figure_of_the_whole_chain() -> Non
     assert [
         page for page in other if re.search(r"9\d[\d.]* to 9\d[\d.]* % of (the|cases)", page.read_text("utf-8"))
     ] == []
+
+
+def test_programs_were_tested_with_the_versions_of_constraints() -> None:
+    pins = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line)
+    rows = [line.split("|")[-2] for line in (ROOT / "docs/reference/programs.md").read_text().splitlines() if "|" in line]
+    told = dict(re.findall(r"([a-z][\w-]+) (\d+\.\d[\d.]*)", " ".join(rows)))
+    assert len(told) > 10
+    assert told == {name: pins[name] for name in told}
