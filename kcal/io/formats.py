@@ -307,7 +307,8 @@ def import_cameras(
 
     OpenCV (YAML, XML; fisheye and omnidir, too), ROS camera_info and bags with it, Kalibr camchains and results, mrcal,
     COLMAP, nerfstudio, MATLAB structs, OpenSfM, TOML of aniposelib, pose2sim and Caliscope, Qualisys, Agisoft
-    Metashape, and kcal's priors for other programs. Error bars come with a camera where its file has them.
+    Metashape, devices and data sets (depthai, Azure Kinect, RealSense, ZED, EuRoC, KITTI, Open3D, nuScenes, DJI), and
+    kcal's priors for other programs. Error bars come with a camera where its file has them.
     Principal points are converted to kcal's convention: (0, 0) is the center of the first pixel.
 
     Args:

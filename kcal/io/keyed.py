@@ -245,12 +245,12 @@ def _cameras_inside(content: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     inside: Any = next((tables.pop(key) for key in list(tables) if bare(key) == "cameras"), {})
     if isinstance(inside, list):
         inside = {str(i): part for i, part in enumerate(inside)}
-    tables |= inside if isinstance(inside, Mapping) else {}
+    inside = inside if isinstance(inside, Mapping) else {}
     # Blocks such as `projection_parameters` are parts of one camera.
+    own = {key: part for key, part in tables.items() if not re.search("param|intrin|proj", bare(key))}
     return {
-        str(key): part for key, part in tables.items()
+        str(key): part for key, part in (own | inside).items()
         if isinstance(part, Mapping) and "data" not in part and has_camera(_flattened(part))
-        and not re.search("param|intrin|proj", bare(key))
     }  # fmt: skip
 
 
