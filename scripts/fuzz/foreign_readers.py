@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from kcal.io.foreign import ImportedCameras
 from kcal.io.format_prior import prior_of, write_priors
 from kcal.io.formats import FORMATS, import_cameras
 from kcal.lens import CameraCalibration, export_cameras
+from scripts.check.device_files import files
 from scripts.fuzz.reader import Reader, whole_text
 
 BOARD = Board(columns=3, rows=2, square=0.1)
@@ -134,6 +136,9 @@ READERS: dict[str, Reader] = {
     "Kalibr's results": Reader(lambda path: import_cameras(path, size=(320, 240)), ".txt", whole_text(_RESULTS)),
     "qualisys": Reader(lambda path: import_cameras(path, format="qualisys"), ".txt", whole_text(_QUALISYS)),
     "agisoft": Reader(lambda path: import_cameras(path, format="agisoft"), ".xml", whole_text(_AGISOFT)),
+    **{program: Reader(lambda path: import_cameras(path, size=(1280, 720)), Path(name).suffix,
+                       whole_text(content if isinstance(content, str) else json.dumps(content)))
+       for program, _, _, name, content, _ in files() if program in ("Azure Kinect", "ZED", "KITTI")},
     "any camera": Reader(import_cameras, ".yml",
                          lambda path: export_cameras(CAMERA, path, format="opencv", model="opencv5")),
     "target": Reader(target_fields, ".yaml", whole_text(

@@ -97,3 +97,12 @@ def test_damaged_ones_are_refused() -> None:
     for broken in (data[:200], data[:-2000], b""):
         with pytest.raises(FileError, match=r"a\.nef: a raw image that LibRaw cannot read"):
             decode_gray(broken, "a.nef")
+
+
+def test_colors_are_interpolated_linearly() -> None:
+    """Methods that follow edges are not linear, and shift edges by what lies beside them."""
+    draw = np.random.default_rng(3)
+    one, other = (draw.integers(0, 256, (48, 64)).astype(float) for _ in range(2))
+    mixed = decode_image(dng(mosaic(0.5 * (one + other))), "a.dng").astype(float)
+    both = [decode_image(dng(mosaic(picture)), "a.dng").astype(float) for picture in (one, other)]
+    assert np.abs(mixed - 0.5 * (both[0] + both[1])).max() < 20  # of 65535: levels are rounded to 14 bits
