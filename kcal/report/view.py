@@ -29,6 +29,7 @@ from kcal.locate.points import camera_poses
 from kcal.locate.positions import Located
 from kcal.locate.survey import Survey
 from kcal.locate.tables import NUMBERS
+from kcal.opencv import cv2
 from kcal.report.tables import interval_text, range_unit
 from kcal.solve.lm import LMOptions
 from kcal.texts import unix_seconds
@@ -229,13 +230,10 @@ class _Recorded:
         corner = np.arange((_CELLS + 1) ** 2).reshape(_CELLS + 1, -1)[:-1, :-1].reshape(-1, 1)
         cells = (corner + np.array([0, 1, _CELLS + 1, 1, _CELLS + 2, _CELLS + 1])).reshape(-1, 3)
         step = -(-max(size) // _TEXTURE)
-        high, wide = height // step, width // step
-        small = image[: high * step, : wide * step, None] if image.ndim == 2 else image[: high * step, : wide * step]
-        small = small.reshape(high, step, wide, step, -1).mean((1, 3)).round().astype(np.uint8)
+        small = cv2.resize(image, (width // step, height // step), interpolation=cv2.INTER_AREA)
         return self.rr.Mesh3D(
             vertex_positions=self.reach * rays.numpy(), triangle_indices=cells[valid.numpy()[cells].all(-1)],
-            vertex_texcoords=np.minimum(share * [width / (wide * step), height / (high * step)], 1.0),
-            albedo_texture=np.broadcast_to(small, (high, wide, 3)),
+            vertex_texcoords=share, albedo_texture=small if small.ndim == 3 else np.stack([small] * 3, -1),
         )  # fmt: skip
 
     def add_positions(self, located: Located) -> None:
