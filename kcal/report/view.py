@@ -276,7 +276,7 @@ class _Recorded:
         self.put(["targets"], rr.Points3D, color | {"radii": self.dots(4)}, *at, positions=places, labels=labels)
         if times is not None:
             past = rr.Points3D(places, colors=_FAINT, radii=self.dots(1.5))
-            self.recording.log("targets/at all times", past, static=True)
+            self.recording.log(["targets", "at all times"], past, static=True)
 
     def add_landmarks(self, survey: Survey) -> None:
         """Landmarks with their names."""

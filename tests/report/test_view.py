@@ -170,12 +170,16 @@ def test_positions_have_ellipsoids_intervals_and_labels(tmp_path: Path) -> None:
         (["0.5", "2", "0.5"], "duration[ns]"),
     ],
 )
-def test_times_are_those_of_the_table(times: list[str], unit: str, tmp_path: Path) -> None:
+def test_times_are_those_of_the_table(
+    times: list[str], unit: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     from rerun.chunk import RrdReader
 
     points = spread_points(tensor(100.0, 900.0, 4000.0))
     marks = Marks(("a", "b", "c"), standing().rig(points)[0], extras={"time": times})
     path = save_view(tmp_path / "a.rrd", standing(), located := locate_points(standing(), marks))
+    # Nor does rerun complain.
+    assert capfd.readouterr().err == ""
     data = recorded(path)
     centers, labels = data["/targets/ellipsoids"]["Ellipsoids3D:centers"], data["/targets"]["Points3D:labels"]
     assert len(centers) == len(labels) == 2
