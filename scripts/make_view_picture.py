@@ -22,7 +22,7 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parent.parent
 SIGMA = 0.1
 # Of the window, points; and its bars above and below the scene, which are cut off, at 2 pixels a point.
-WIDTH, HEIGHT = 860, 600
+WIDTH, HEIGHT = 720, 560
 # Pixels a point of the picture.
 SCALE = 1.5
 ABOVE, BELOW = 124, 60
@@ -59,7 +59,7 @@ def screenshot(recording: Path, picture: Path) -> None:
     """Open a recording in the viewer and save what it shows, without the bars of its window."""
     shot = recording.with_suffix(".png")
     # The mouse is in the middle of the display: the window is beside it.
-    display = ["xvfb-run", "-a", "-s", f"-screen 0 {3 * WIDTH}x{3 * HEIGHT}x24"]
+    display = ["xvfb-run", "-a", "-s", f"-screen 0 {5 * WIDTH}x{5 * HEIGHT}x24"]
     where = f"--port auto --bind 127.0.0.1 --window-size {WIDTH}x{HEIGHT} --screenshot-to".split()
     viewer = [sys.executable, "-m", "rerun_cli", str(recording), *where, str(shot)]
     home = str(recording.parent)

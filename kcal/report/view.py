@@ -179,8 +179,8 @@ class _Recorded:
             center, turn = camera_poses(localize)
         self.zero = ((center.mean(0) / _FAR).round() * _FAR).numpy()
         self.center, self.turn = center.numpy() - self.zero, turn.numpy()
-        # Radius of the spheres; what is shown; and how far boards are from their cameras.
-        self.reach, self.places, self.away = 1.0, np.zeros((0, 3)), [0.0]
+        # Radius of the spheres, and what is drawn on them; what is shown; and how far boards are from their cameras.
+        self.reach, self.drawn, self.places, self.away = 1.0, [self.center], np.zeros((0, 3)), [0.0]
         self.level = localize.on_earth or not localize.rig.in_first_frame
         recording.log("/", rr.ViewCoordinates.RFU if self.level else rr.ViewCoordinates.RDF, static=True)
 
@@ -202,6 +202,7 @@ class _Recorded:
         pose = rr.Transform3D(translation=self.center[camera], quaternion=turn)
         self.recording.log(path, pose, rr.ViewCoordinates.RDF, static=True)
         edge = self.reach * field_border(self.cameras[camera])[0].numpy()
+        self.drawn.append(self.center[camera] + edge @ self.turn[camera].T)
         strips = [np.concatenate([edge, edge[:1]]), *(np.stack([0 * ray, ray]) for ray in edge[::_SIDE])]
         lines = rr.LineStrips3D(strips, colors=color, radii=self.dots(0.8))
         self.recording.log([*path, "field of view"], lines, static=True)
@@ -334,11 +335,12 @@ class _Recorded:
 
     def blueprint(self) -> Any:
         """One view from above the cameras and from their side, from which ellipsoids show how long they are."""
-        show = self.rr.blueprint
-        up = np.array([0, 0, 1.0]) if self.level else np.array([0, -1.0, 0])
-        forward, middle = self.turn[:, :, 2].mean(0), self.center.mean(0)
-        aside, ahead = 0.5 * up - 0.25 * forward + 0.4 * np.cross(forward, up), 0.5 * self.reach * forward
-        eye = show.EyeControls3D(position=middle + self.reach * aside, look_target=middle + ahead, eye_up=up)
+        show, drawn = self.rr.blueprint, np.concatenate(self.drawn)
+        up, forward = np.array([0, 0, 1.0]) if self.level else np.array([0, -1.0, 0]), self.turn[:, :, 2].mean(0)
+        aside = 0.6 * up - 0.8 * forward + 0.5 * np.cross(forward, up)
+        low, high = drawn.min(0), drawn.max(0)
+        middle, away = (low + high) / 2, 0.75 * np.linalg.norm(high - low) / np.linalg.norm(aside)
+        eye = show.EyeControls3D(position=middle + away * aside, look_target=middle, eye_up=up)
         return show.Blueprint(
             show.Spatial3DView(origin="/", name="kcal", eye_controls=eye), show.BlueprintPanel(state="collapsed"),
             show.SelectionPanel(state="collapsed"), show.TimePanel(state="collapsed"),
