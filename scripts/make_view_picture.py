@@ -22,7 +22,7 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parent.parent
 SIGMA = 0.1
 # Of the window, points; and its bars above and below the scene, which are cut off, at 2 pixels a point.
-WIDTH, HEIGHT = 720, 560
+WIDTH, HEIGHT = 750, 560
 # Pixels a point of the picture.
 SCALE = 1.5
 ABOVE, BELOW = 124, 60

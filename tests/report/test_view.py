@@ -227,6 +227,23 @@ def test_boards_stand_where_the_camera_saw_them(tmp_path: Path) -> None:
     assert colors[-1, -1].tolist() == [200] * 3
 
 
+def test_the_view_begins_outside_of_what_is_drawn(tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(save_view(tmp_path / "a.rrd", alone(WIDE), reach=9.0))
+    (blueprint,) = reader.blueprints()
+    parts = [part.to_record_batch() for part in reader.stream(store=blueprint)]
+    (eye,) = (
+        part["EyeControls3D:position"].to_pylist()[0][0]
+        for part in parts
+        if "EyeControls3D:position" in part.schema.names
+    )
+    assert np.linalg.norm(eye) > 9.0
+    # From above, y being down, and from behind.
+    assert eye[1] < 0
+    assert eye[2] < 0
+
+
 def test_what_has_no_ray_carries_no_image(tmp_path: Path) -> None:
     mesh = recorded(save_view(tmp_path / "a.rrd", alone(WIDE), np.zeros((960, 1280), np.uint8)))["/cameras/eye/image"]
     cells = only(mesh["Mesh3D:triangle_indices"])
