@@ -109,6 +109,12 @@ class TestFolderOfStamps:
         found = detect_video(write_bag(tmp_path / "run.bag", "ros1", shots), BOARD)
         assert found.names == (f"{START // 10**9}.{START % 10**9 + 3 * STEP // 2:09d}.png",)
 
+    def test_messages_of_another_order_of_bytes(self, tmp_path: Path) -> None:
+        shots = [(TOPIC, START + 5, lambda s: raw(s, START, still(0), "mono8"))]
+        (path,) = expand_images([write_bag(tmp_path / "run", "mcap", shots, little_endian=False)])
+        assert path.name == "1700000000.123456789.png"
+        assert np.array_equal(read_gray(path), still(0))
+
     def test_no_stamp(self, tmp_path: Path) -> None:
         shots = [(TOPIC, START + i, lambda s: raw(s, 0, still(0), "mono8")) for i in range(2)]
         bag = write_bag(tmp_path / "run", "sqlite3", shots)

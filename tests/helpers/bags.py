@@ -42,8 +42,8 @@ def compressed(store: Any, stamp: int, image: np.ndarray, suffix: str, words: st
     return store.types["sensor_msgs/msg/CompressedImage"](header=header(store, stamp), format=words, data=data)
 
 
-def write_bag(path: Path, kind: str, messages: list[Written]) -> Path:
-    """A file for ROS 1, a folder for ROS 2."""
+def write_bag(path: Path, kind: str, messages: list[Written], **order: bool) -> Path:
+    """A file for ROS 1, a folder for ROS 2; `little_endian=False` is the order of bytes of some machines of ROS 2."""
     store, connections = STORES[kind], {}
     plugin = {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
     writer: Any = Writer1(path) if kind == "ros1" else Writer2(path, version=8, storage_plugin=plugin[kind])
@@ -53,5 +53,5 @@ def write_bag(path: Path, kind: str, messages: list[Written]) -> Path:
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
             encode = store.serialize_ros1 if kind == "ros1" else store.serialize_cdr
-            writer.write(connections[topic], recorded, encode(message, message.__msgtype__))
+            writer.write(connections[topic], recorded, encode(message, message.__msgtype__, **order))
     return path
