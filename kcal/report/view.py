@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 from torch import Tensor
@@ -29,7 +30,6 @@ from kcal.locate.points import camera_poses
 from kcal.locate.positions import Located
 from kcal.locate.survey import Survey
 from kcal.locate.tables import NUMBERS
-from kcal.opencv import cv2
 from kcal.report.tables import interval_text, range_unit
 from kcal.solve.lm import LMOptions
 from kcal.texts import unix_seconds
@@ -231,7 +231,7 @@ class _Recorded:
         corner = np.arange((_CELLS + 1) ** 2).reshape(_CELLS + 1, -1)[:-1, :-1].reshape(-1, 1)
         cells = (corner + np.array([0, 1, _CELLS + 1, 1, _CELLS + 2, _CELLS + 1])).reshape(-1, 3)
         step = -(-max(size) // _TEXTURE)
-        small = cv2.resize(image, (width // step, height // step), interpolation=cv2.INTER_AREA)
+        small = np.asarray(Image.fromarray(image).resize((width // step, height // step), Image.Resampling.BOX))
         return self.rr.Mesh3D(
             vertex_positions=self.reach * rays.numpy(), triangle_indices=cells[valid.numpy()[cells].all(-1)],
             vertex_texcoords=share, albedo_texture=small if small.ndim == 3 else np.stack([small] * 3, -1),
