@@ -236,7 +236,8 @@ def test_how_often_intervals_are_right_is_one_figure_of_the_whole_chain() -> Non
 
 def test_programs_were_tested_with_the_versions_of_constraints() -> None:
     pins = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line)
-    rows = [line.split("|")[-2] for line in (ROOT / "docs/reference/programs.md").read_text().splitlines() if "|" in line]
+    page = (ROOT / "docs/reference/programs.md").read_text()
+    rows = [line.split("|")[-2] for line in page.splitlines() if "|" in line]
     told = dict(re.findall(r"([a-z][\w-]+) (\d+\.\d[\d.]*)", " ".join(rows)))
     assert len(told) > 10
     assert told == {name: pins[name] for name in told}
