@@ -34,7 +34,7 @@ PUBLIC = {
     """,
     "kcal.lens": """
         CameraCalibration CameraLike CameraRays ExtendedDistortion ImageTransform LensModel LensSetting
-        StereoRectification Undistort UndistortImage Unproject bake camera_difference cylinder_view
+        StereoRectification Undistort UndistortImage Unproject bake camera_difference ceres_prior cylinder_view
         export_cameras import_cameras load_lookup looking pinhole_view pixel_covariance refit_camera
         rotation_from_vector save_lookup save_onnx undistort_maps vector_from_rotation
     """,
@@ -104,6 +104,7 @@ RECORDS = {
 }
 # They write a picture or page of a whole result, or need a video, raster or observations: see the tests of their rooms.
 WITHOUT_EXAMPLE = {
+    "ceres_prior",
     "terrain",
     "detect_video",
     "paired_boards",

@@ -51,9 +51,9 @@ def export_command(
     Args:
         source: Camera or rig of kcal; RIG.json:left is one of its cameras.
         output: File to write.
-        format: opencv, ros, bag, kalibr, mrcal, colmap, nerfstudio, matlab, opensfm, toml, gtsam, ceres, numpy or
-            remap.
-        model: Lens model of the format to fit, for example opencv5.
+        format: opencv, ros, bag, kalibr, basalt, mrcal, colmap, nerfstudio, matlab, opensfm, toml, multical, gtsam,
+            ceres, numpy or remap.
+        model: Lens model of the format to fit, for example opencv5, or a lens of the program, for example ds.
         picture: error of a refitted lens over the image.
     """
     path, name = named_source(source)

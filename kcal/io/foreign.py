@@ -23,7 +23,7 @@ from kcal.file_kind import check_pixel_count
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
-from kcal.lens.pose import Pose, nearest_rotation
+from kcal.lens.pose import Pose, nearest_rotation, rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import Rig
 from kcal.texts import brief
 
@@ -142,6 +142,27 @@ def checked_pose(rotation: Any, translation: Any) -> Pose:
     # One that is exact already stays as it is, to the last bit.
     same = float((matrix - exact).abs().max()) < 1e-14
     return Pose(matrix if same else exact, torch.tensor(translation, dtype=torch.float64).reshape(3))
+
+
+def moved_by(quaternion: Sequence[float], translation: Sequence[float]) -> Pose:
+    """A pose from a quaternion (4,) of any length, w first, and a translation (3,), meters."""
+    turn = torch.tensor(quaternion, dtype=torch.float64)
+    if not 0.0 < float(turn.square().sum()) < math.inf:
+        raise ValueError("a quaternion is zero, or not finite")
+    length = turn[1:].norm()
+    rotation = rotation_from_vector(2.0 * torch.atan2(length, turn[0]) * turn[1:] / length.clamp_min(1e-300))
+    return checked_pose(rotation.tolist(), translation)
+
+
+def quaternion_of(rotation: Tensor) -> list[float]:
+    """w, x, y, z of a rotation (3, 3).
+
+    Example:
+        >>> [round(each, 12) for each in quaternion_of(moved_by([1.0, 1.0, -1.0, 1.0], [0.0, 0.0, 0.0]).rotation)]
+        [0.5, 0.5, -0.5, 0.5]
+    """
+    turn = vector_from_rotation(rotation.double())
+    return [float((0.5 * turn.norm()).cos()), *(0.5 * turn * torch.sinc(0.5 * turn.norm() / math.pi)).tolist()]
 
 
 def named_camera(

@@ -133,6 +133,12 @@ def _modified(v: Sequence[Tensor], X: Tensor, Y: Tensor, Z: Tensor) -> Plane:
     return across, b + 2.0 * v[3] * a * b + v[2] * (square + 2.0 * b * b), there
 
 
+def _equisolid(v: Sequence[Tensor], X: Tensor, Y: Tensor, Z: Tensor) -> Plane:
+    """Twice the sine of half the angle from the axis."""
+    scale = (2.0 / (1.0 + Z).clamp_min(1e-9)).sqrt()
+    return _bent(X * scale, Y * scale, v[:4], v[4:])
+
+
 _THETA = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
 # Names of Metashape in the order of OpenCV, whose p1 is its p2.
 _PARTIAL = ("k1", "k2", "k3", "k4", "p2", "p1", "p3", "p4")
@@ -152,6 +158,7 @@ LENSES = {
     "frame with p3, p4": ForeignLens(_PARTIAL, _frame),
     "modified_brown_conrady": ForeignLens(("k1", "k2", "p1", "p2", "k3"), _modified),
     "fisheye with p1 to p4": ForeignLens(_PARTIAL, _fisheye),
+    "equisolid fisheye": ForeignLens(_PARTIAL, _equisolid),
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Kalibr: camchains and results of its calibrations."""
+"""Visual-inertial programs: camchains and results of Kalibr, and calibrations of Basalt."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 import kcal.io.foreign as foreign
-from kcal.files import read_text, write_atomic
-from kcal.io.foreign_lenses import ForeignCamera, as_written, foreign_camera
+from kcal.files import dump_json, read_bytes, read_text, write_atomic
+from kcal.io.foreign_lenses import LENSES, ForeignCamera, as_written, foreign_camera
 from kcal.lens.camera import Camera
 from kcal.lens.pose import Pose
 from kcal.strict_formats import MOST_YAML, read_yaml
+from kcal.strict_json import read_json
 
 # Kalibr's camchain YAML: `cam0`, `cam1`, ... with `T_cn_cnm1` from each camera to the next.
 
@@ -144,3 +145,75 @@ def write_kalibr(cameras: Sequence[Camera | ForeignCamera], poses: Sequence[Pose
             part["T_cn_cnm1"] = whole.tolist()
         content[f"cam{i}"] = part
     return [write_atomic(path, foreign.dump_yaml(content))]
+
+
+# Basalt's `calibration.json`: lenses by their names, sizes, and the pose of each camera in the frame of the IMU.
+
+# Of each camera_type: kcal's model or the lens of `LENSES`, and the parameters after fx, fy, cx, cy in its order.
+BASALT_LENSES = {
+    "pinhole": ("pinhole", ()),
+    "pinhole-radtan8": ("opencv8", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "kb4": ("fisheye4", ("k1", "k2", "k3", "k4")),
+    "ds": ("ds", ("xi", "alpha")),
+    "eucm": ("eucm", ("alpha", "beta")),
+    "ucm": ("eucm", ("alpha",)),
+    "fov": ("fov", ("w",)),
+}
+_BASALT_POSE = ("px", "py", "pz", "qw", "qx", "qy", "qz")
+
+
+def read_basalt(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
+    """Read all cameras; poses are from the frame of the IMU."""
+    content = foreign.Keys(read_json(read_bytes(path, foreign.MOST_BYTES), str(path))["value0"])
+    lenses, sizes, notes = content["intrinsics"], content["resolution"], ["what is known of the IMU is not kept"]
+    if not len(lenses) == len(sizes):
+        raise ValueError(f"{len(lenses)} intrinsics and {len(sizes)} resolutions; as many are needed")
+    cameras, unread = foreign.each_readable(
+        (f"cam{i}", partial(_basalt_camera, f"cam{i}", lens, foreign.whole_size(*size), notes))
+        for i, (lens, size) in enumerate(zip(lenses, sizes, strict=True))
+    )
+    stated = content.get("T_imu_cam", [])
+    if len(stated) not in (0, len(lenses)):
+        raise ValueError(f"{len(lenses)} intrinsics and {len(stated)} T_imu_cam; as many are needed")
+    moves = [foreign.numbers([one[key] for key in _BASALT_POSE], 7, "T_imu_cam") for one in stated]
+    poses = tuple(
+        foreign.moved_by(move[3:], move[:3]).inverse() for i, move in enumerate(moves) if f"cam{i}" not in unread
+    )
+    return foreign.ImportedCameras(format="basalt", cameras=cameras, poses=poses, notes=tuple(notes), unread=unread)
+
+
+def _basalt_camera(name: str, lens: Mapping[str, Any], size: tuple[int, int], notes: list[str]) -> Camera:
+    kind, given = str(lens["camera_type"]), foreign.Keys(lens["intrinsics"])
+    if kind not in BASALT_LENSES:
+        raise ValueError(f"{name}: camera_type {kind}: kcal reads {', '.join(BASALT_LENSES)}")
+    model, terms = BASALT_LENSES[kind]
+    core, own = ([foreign.numbers(given[key], 1, key)[0] for key in keys] for keys in (("fx", "fy", "cx", "cy"), terms))
+    given.get("rpmax")
+    given.rest(f"{name}.")
+    if model not in LENSES:
+        return foreign.named_camera(name, core, size, model, own)
+    # The unified lens is the enhanced one with β = 1.
+    camera, note = foreign_camera(model, name, core, size, [*own, 1.0] if kind == "ucm" else own)
+    notes.append(note)
+    return camera
+
+
+def write_basalt(cameras: Sequence[Camera | ForeignCamera], poses: Sequence[Pose], path: Path) -> list[Path]:
+    """Write all cameras, with the rig's frame in place of the IMU's."""
+    kinds = {model: kind for kind, (model, _) in BASALT_LENSES.items() if kind != "ucm"}
+    intrinsics, places = [], []
+    for i, camera in enumerate(cameras):
+        _, model, (fx, fy, cx, cy, _, *own) = as_written(camera)
+        values = dict(
+            zip(("fx", "fy", "cx", "cy", *BASALT_LENSES[kinds[model]][1]), (fx, fy, cx, cy, *own), strict=True)
+        )
+        if model == "opencv8":
+            # Points beyond this distance from the axis, at depth one, are not projected.
+            assert isinstance(camera, Camera)
+            values["rpmax"] = 1.01 * float(camera.normalize(camera.grid(33, 25))[0].norm(dim=-1).max())
+        intrinsics.append({"camera_type": kinds[model], "intrinsics": values})
+        pose = (poses[i] if poses else Pose.still()).inverse()
+        numbers = [*foreign.plain(pose.translation), *foreign.quaternion_of(pose.rotation)]
+        places.append(dict(zip(_BASALT_POSE, numbers, strict=True)))
+    content = {"T_imu_cam": places, "intrinsics": intrinsics, "resolution": [list(camera.size) for camera in cameras]}
+    return [write_atomic(path, dump_json({"value0": content}))]

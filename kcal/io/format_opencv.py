@@ -1,4 +1,4 @@
-"""Files of OpenCV's lens models: OpenCV itself, ROS, Anipose and Caliscope (TOML), and MATLAB."""
+"""Files of OpenCV's lens models: OpenCV itself, ROS, Anipose and Caliscope (TOML), multical, calib.io, and MATLAB."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from kcal.errors import InputError
-from kcal.files import read_bytes, read_text, write_atomic
+from kcal.files import dump_json, read_bytes, read_text, write_atomic
 from kcal.io.foreign import (
     MOST_BYTES,
     Hints,
@@ -32,8 +33,10 @@ from kcal.io.foreign import (
     whole_size,
     with_sigmas,
 )
+from kcal.io.foreign_lenses import nearest_hybrid
 from kcal.io.keyed import flat, read_keyed
 from kcal.lens.camera import Camera
+from kcal.lens.model import LensModel
 from kcal.lens.pose import Pose, vector_from_rotation
 from kcal.opencv import cv2
 from kcal.strict_formats import read_mat, read_npz, read_storage, read_yaml
@@ -248,6 +251,79 @@ def write_toml(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> 
     return [write_atomic(path, "\n".join([*lines, "[metadata]", ""]))]
 
 
+# multical's `calibration.json`: OpenCV's cameras by name, and cam_from_rig of each; `left_to_right` is left_from_right.
+
+
+def read_multical(path: Path, hints: Hints) -> ImportedCameras:
+    """Read all cameras; poses are from the frame of the rig, or of the camera that has none to another."""
+    content = read_json(read_bytes(path, MOST_BYTES), str(path))
+    found = read_keyed({"cameras": content["cameras"]}, path.stem, hints, "multical")
+    stated = {
+        name: checked_pose(value["R"], numbers(value["T"], 3, f"T of {name}"))
+        for name, value in content.get("camera_poses", {}).items()
+    }
+
+    def posed(name: str, depth: int = 0) -> Pose | None:
+        if name in stated or depth > len(stated):
+            return stated.get(name)
+        key = next((key for key in stated if key.startswith(f"{name}_to_")), None)
+        other = None if key is None else posed(key.removeprefix(f"{name}_to_"), depth + 1)
+        return None if key is None or other is None else stated[key].after(other)
+
+    poses = [posed(name) for name in found.names]
+    whole = tuple(pose for pose in poses if pose is not None)
+    lacking = [name for name, pose in zip(found.names, poses, strict=True) if pose is None]
+    notes = (f"no pose of {', '.join(lacking)}: no pose is read",) if lacking and whole else ()
+    return dataclasses.replace(found, poses=() if lacking else whole, notes=(*found.notes, *notes))
+
+
+def write_multical(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
+    """Write all cameras, with their poses if there are any."""
+    names = [camera_name(camera, f"cam{i}") for i, camera in enumerate(cameras)]
+    kinds = {8: "rational", 12: "thin_prism", 14: "tilted"}
+    lenses = {
+        name: {
+            "model": kinds.get(camera.model.size, "standard"),
+            "image_size": list(camera.size),
+            "K": plain(camera.matrix),
+            "dist": [camera.coefficients.tolist() + [0.0] * (5 - camera.model.size)],
+        }
+        for name, camera in zip(names, cameras, strict=True)
+    }
+    places = {name: {"R": plain(R), "T": plain(t)} for name, (R, t) in zip(names, poses, strict=False)}
+    return [write_atomic(path, dump_json({"cameras": lenses} | ({"camera_poses": places} if places else {})))]
+
+
+# calib.io's JSON: OpenCV's lens, or MATLAB's with a skew; f is fx, and ar = fy / fx.
+
+
+def read_calibio(path: Path, hints: Hints) -> ImportedCameras:
+    """Read all cameras; which way their transforms lead is not published, and so they are not read."""
+    parts = read_json(read_bytes(path, MOST_BYTES), str(path))["Calibration"]["cameras"]
+    cameras = {f"camera_{i}": _calibio_camera(part["model"]) for i, part in enumerate(parts)}
+    found = read_keyed({"cameras": cameras}, path.stem, hints, "calibio")
+    lost = ("how the cameras stand to each other is not read: solve the rig with kcal rig",) if len(parts) > 1 else ()
+    return dataclasses.replace(found, notes=(*found.notes, *lost))
+
+
+def _calibio_camera(model: Mapping[str, Any]) -> dict[str, Any]:
+    kind, data = str(model["polymorphic_name"]), model["ptr_wrapper"]["data"]
+    if kind not in ("libCalib::CameraModelOpenCV", "libCalib::CameraModelMatlab"):
+        raise ValueError(f"model {kind}: kcal reads libCalib::CameraModelOpenCV and libCalib::CameraModelMatlab")
+    given = {name: numbers(part["val"], 1, name)[0] for name, part in data["parameters"].items()}
+    order = LensModel.named("opencv14").names if kind.endswith("CV") else LensModel.named("opencv5").names
+    terms = {name: given.pop(name.replace("tau_x", "tauX").replace("tau_y", "tauY"), 0.0) for name in order}
+    f, ratio, cx, cy, skew = (given.pop(name, otherwise) for name, otherwise in _CALIBIO.items())
+    if strange := [name for name, value in given.items() if value]:
+        raise ValueError(f"{', '.join(strange)}: parameters that kcal does not know")
+    base = data["CameraModelCRT"]["CameraModelBase"]
+    size = base.get("imageSize") or {"width": base["imageWidth"], "height": base["imageHeight"]}
+    return {"fx": f, "fy": f * ratio, "cx": cx, "cy": cy, "skew": skew, "dist": list(terms.values()), **size}
+
+
+_CALIBIO = {"f": 0.0, "ar": 1.0, "cx": 0.0, "cy": 0.0, "skew": 0.0}
+
+
 # MATLAB's camera parameters as a struct in a `.mat` file (version 5 to 7.2), as `toStruct` makes it.
 #
 # Pixel (1, 1) is the center of the first pixel there. Old releases have the intrinsic matrix and rotations transposed,
@@ -272,6 +348,10 @@ def read_matlab(path: Path, hints: Hints) -> ImportedCameras:
         if isinstance(value, Mapping) and "CameraParameters1" in value:
             return _with_errors(_pair(value, hints), [errors.get(f"Camera{i}IntrinsicsErrors") for i in (1, 2)])
     for name, value in candidates:
+        inner = value.get("Intrinsics", value) if isinstance(value, Mapping) else {}
+        if isinstance(inner, Mapping) and "MappingCoefficients" in inner:
+            camera, note = _scaramuzza(inner, name, hints)
+            return ImportedCameras(format="matlab", cameras=(camera,), notes=(note,))
         if isinstance(value, Mapping) and {"K", "IntrinsicMatrix", "FocalLength"} & set(value):
             found = ImportedCameras(format="matlab", cameras=(_matlab_camera(value, name, hints),))
             return _with_errors(found, [errors.get("IntrinsicsErrors")])
@@ -332,6 +412,29 @@ def _matlab_camera(value: Mapping[str, Any], name: str, hints: Hints) -> Camera:
     tangential = numbers(value.get("TangentialDistortion", []), (0, 2), "TangentialDistortion") or [0.0, 0.0]
     lens = [*radial[:2], *tangential, *radial[2:]] if radial else [0.0, 0.0, *tangential]
     return named_camera(name, (fx, fy, cx - 1, cy - 1), size, f"opencv{len(lens)}", lens, skew)
+
+
+def _scaramuzza(value: Mapping[str, Any], name: str, hints: Hints) -> tuple[Camera, str]:
+    """MATLAB's `fisheyeIntrinsics`: the ray of a place (x, y) on the sensor is (x, y, a0 + a2 ρ² + a3 ρ³ + a4 ρ⁴).
+
+    Source: Scaramuzza, Martinelli and Siegwart 2006, and MATLAB's documentation of `fisheyeIntrinsics`.
+    """
+    a0, *rest = numbers(value["MappingCoefficients"], 4, "MappingCoefficients")
+    u, v = numbers(value["DistortionCenter"], 2, "DistortionCenter")
+    stretch = numbers(value.get("StretchMatrix", [1.0, 0.0, 0.0, 1.0]), 4, "StretchMatrix")
+    size = known_size(hints.size or whole_size(*numbers(value["ImageSize"], 2, "ImageSize")[::-1]))
+    back = torch.linalg.inv(torch.tensor(stretch, dtype=torch.float64).reshape(2, 2))
+
+    def unproject(pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        plane = (pixels + 1.0 - pixels.new_tensor([u, v])) @ back.T
+        radius = plane.norm(dim=-1)
+        depth = a0 + sum(a * radius**n for n, a in enumerate(rest, 2))
+        # Where angles from the axis grow with the radius.
+        grows = a0 - sum((n - 1) * a * radius**n for n, a in enumerate(rest, 2)) > 0
+        return torch.nn.functional.normalize(torch.cat([plane, depth[:, None]], -1), dim=-1), grows
+
+    like = named_camera(name, (a0, a0, u - 1.0, v - 1.0), size, "pinhole")
+    return nearest_hybrid(unproject, like, "its fisheye lens of MATLAB")
 
 
 def _pair(value: Mapping[str, Any], hints: Hints) -> ImportedCameras:

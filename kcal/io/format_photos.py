@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 import re
+import sqlite3
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +19,7 @@ import torch
 
 import kcal.io.foreign as foreign
 from kcal.errors import InputError
-from kcal.files import dump_json, read_bytes, read_text, write_atomic
+from kcal.files import dump_json, read_bytes, read_head, read_text, write_atomic
 from kcal.io.foreign_lenses import LENSES, ForeignCamera, as_written, foreign_camera
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
@@ -31,8 +33,8 @@ from kcal.strict_json import read_json, read_xml
 #     y' = y (1 + ...) + p2 (r² + 2y²) + 2 p1 x y,                            v = height / 2 + cy + y' f
 #
 # Pixel (0.5, 0.5) is the center of the first pixel there. p1 and p2 are OpenCV's p2 and p1 (Metashape's manual,
-# appendix D). A fisheye has θ in place of r = tan θ. Older versions multiply the terms of p1 and p2 by
-# 1 + p3 r² + p4 r⁴.
+# appendix D). A fisheye has θ in place of r = tan θ, an equisolid one 2 sin(θ / 2). Older versions multiply the terms
+# of p1 and p2 by 1 + p3 r² + p4 r⁴.
 
 # What of kcal's parameters changes with each of Metashape's.
 _FRAME = {"f": ("fx", "fy"), "b1": ("fx",), "b2": ("skew",), "cx": ("cx",), "cy": ("cy",), "p1": ("p2",), "p2": ("p1",),
@@ -60,8 +62,13 @@ def _agisoft_camera(sensor: Element, number: int, notes: list[str]) -> Camera:
         raise ValueError("no sensor with a calibration")
     best = next((part for part in found if part.get("class") == "adjusted"), found[0])
     kind = best.get("type") or best.findtext("projection") or "frame"
-    if kind not in ("frame", "fisheye"):
-        raise ValueError(f"{name}: a lens of type {kind}: kcal reads frame and fisheye")
+    kind = "fisheye" if kind == "equidistant_fisheye" else kind
+    if kind not in ("frame", "fisheye", "equisolid_fisheye") or best.find("corrections") is not None:
+        extra = " with additional corrections" if best.find("corrections") is not None else ""
+        raise ValueError(
+            f"{name}: a lens of type {kind}{extra}: kcal reads frame, fisheye, equidistant_fisheye and "
+            "equisolid_fisheye without corrections"
+        )
     own = _FISHEYE if kind == "fisheye" else _FRAME
     size = best.find("resolution")
     if size is not None:
@@ -81,8 +88,9 @@ def _agisoft_camera(sensor: Element, number: int, notes: list[str]) -> Camera:
                 values[target] += given[tag]
     fx, fy, cx, cy, skew, *lens = values.values()
     core = (fx, fy, cx + 0.5 * width - 0.5, cy + 0.5 * height - 0.5)
-    if any(value for tag, value in given.items() if tag not in own):
-        kind = "fisheye with p1 to p4" if kind == "fisheye" else "frame with p3, p4"
+    kinds = {"frame": "frame with p3, p4", "fisheye": "fisheye with p1 to p4", "equisolid_fisheye": "equisolid fisheye"}
+    if kind == "equisolid_fisheye" or any(value for tag, value in given.items() if tag not in own):
+        kind = kinds[kind]
         terms = [given[tag] for tag in LENSES[kind].names]
         camera, note = foreign_camera(kind, name, core, (width, height), terms, skew)
         notes.append(note if sensor.find("covariance") is None else f"{note}; its error bars are not kept")
@@ -154,16 +162,100 @@ WRITTEN = {"pinhole": "PINHOLE", "opencv4": "OPENCV", "opencv8": "FULL_OPENCV", 
            "rad-tan-thin-prism": "RAD_TAN_THIN_PRISM_FISHEYE"}  # fmt: skip
 
 
+SQLITE = b"SQLite format 3\0"
+Entries = list[tuple[int, str, tuple[int, int], list[float]]]
+# Rotation (w, x, y, z) and translation of each camera of a rig, by its number.
+Rigs = list[dict[int, Sequence[float]]]
+_STILL, _MOST_ROWS = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 10_000
+
+
 def read_colmap(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
-    """Read all cameras of a reconstruction; they are named by their numbers."""
-    entries = _from_binary(read_bytes(path, foreign.MOST_BYTES)) if path.suffix.lower() == ".bin" else _from_text(path)
+    """Read all cameras of a reconstruction or a database; they are named by their numbers.
+
+    Poses are those of the rig, in `rigs.txt` or `rigs.bin` beside the file or in the database, if one has all cameras.
+    """
+    binary, beside = path.suffix.lower() == ".bin", path.with_name(path.name.replace("cameras", "rigs"))
+    notes, rigs = list[str](), Rigs()
+    if read_head(path, len(SQLITE)) == SQLITE:
+        entries, rigs = _from_database(path, notes)
+    else:
+        entries = _from_binary(read_bytes(path, foreign.MOST_BYTES)) if binary else _from_text(path)
+        if beside != path and beside.exists():
+            with foreign.reading(beside, "COLMAP rig"):
+                rigs = _rigs_in(beside)
     if not entries:
         raise ValueError("no cameras")
-    notes: list[str] = []
     cameras, unread = foreign.each_readable(
         (str(entry[0]), partial(_colmap_camera, *entry, notes)) for entry in entries
     )
-    return foreign.ImportedCameras(format="colmap", cameras=cameras, notes=tuple(notes), unread=unread)
+    numbers = [entry[0] for entry in entries if str(entry[0]) not in unread]
+    whole = next((rig for rig in rigs if len(rig) > 1 and set(numbers) <= set(rig)), None)
+    poses = tuple(
+        foreign.moved_by(move[:4], [(hints.meters or 1.0) * each for each in move[4:]])
+        for move in ([whole[number] for number in numbers] if whole else [])
+    )
+    if poses and not hints.meters:
+        notes.append("lengths of COLMAP's rig are in the unit of its reconstruction: taken as meters (--unit)")
+    elif any(len(rig) > 1 for rig in rigs) and not poses:
+        notes.append("no rig has all cameras with their poses: no pose is read")
+    return foreign.ImportedCameras(format="colmap", cameras=cameras, poses=poses, notes=tuple(notes), unread=unread)
+
+
+def _from_database(path: Path, notes: list[str]) -> tuple[Entries, Rigs]:
+    by_number = {known.number: name for name, known in COLMAP_MODELS.items()}
+    with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as base:
+        base.execute("PRAGMA trusted_schema = OFF")
+        # A view may compute forever.
+        tables = {name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+
+        def rows(table: str, columns: str, where: str = "1") -> list[Any]:
+            if table not in tables:
+                return []
+            return base.execute(f"SELECT {columns} FROM {table} WHERE {where} LIMIT {_MOST_ROWS}").fetchall()
+
+        cameras = rows("cameras", "camera_id, model, width, height, params, prior_focal_length")
+        first = rows("rigs", "rig_id, ref_sensor_id", "ref_sensor_type = 0")
+        moves = rows(
+            "rig_sensors", "rig_id, sensor_id, sensor_from_rig", "sensor_type = 0 AND sensor_from_rig NOT NULL"
+        )
+    entries, rigs = Entries(), {rig: dict[int, Sequence[float]]({sensor: _STILL}) for rig, sensor in first}
+    for number, kind, width, height, data, known in cameras:
+        values = list(struct.unpack(f"<{len(data) // 8}d", data))
+        entries.append((number, by_number.get(kind, f"number {kind}"), foreign.whole_size(width, height), values))
+        if not known:
+            notes.append(f"camera {number}: prior_focal_length is 0, so its focal length is a guess of COLMAP")
+    for rig, sensor, move in (one for one in moves if one[2]):
+        rigs.setdefault(rig, {})[sensor] = struct.unpack("<7d", move)
+    return entries, list(rigs.values())
+
+
+def _rigs_in(path: Path) -> Rigs:
+    """The rigs of `rigs.txt` or `rigs.bin`."""
+    if path.suffix.lower() == ".bin":
+        data, place = read_bytes(path, foreign.MOST_BYTES), [8]
+
+        def take(code: str) -> Any:
+            place[0] += struct.calcsize(code)
+            return struct.unpack_from(f"<{code}", data, place[0] - struct.calcsize(code))[0]
+
+        return [_sensors_of(take) for _ in range(*struct.unpack_from("<Q", data))]
+    lines = (line.split() for line in read_text(path, foreign.MOST_BYTES).splitlines())
+    return [_sensors_of(_taker(iter(line))) for line in lines if line and not line[0].startswith("#")]
+
+
+def _taker(words: Iterator[str]) -> Callable[[str], Any]:
+    return lambda code: {"CAMERA": 0, "IMU": 1}[next(words)] if code == "i" else float(next(words))
+
+
+def _sensors_of(take: Callable[[str], Any]) -> dict[int, Sequence[float]]:
+    """A rig of which `take` gives one value after the other: a kind (i), a number (I), a flag (B) or a length (d)."""
+    rig = dict[int, Sequence[float]]()
+    for i in range([int(take("I")) for _ in range(2)][1]):
+        kind, number = take("i"), int(take("I"))
+        move = _STILL if not i else [take("d") for _ in range(7)] if take("B") else None
+        if kind == 0 and move:
+            rig[number] = move
+    return rig
 
 
 def _colmap_camera(number: int, name: str, size: tuple[int, int], values: Sequence[float], notes: list[str]) -> Camera:
@@ -228,21 +320,44 @@ def _from_binary(data: bytes) -> list[tuple[int, str, tuple[int, int], list[floa
 
 
 def write_colmap(cameras: Sequence[Camera | ForeignCamera], poses: Sequence[Pose], path: Path) -> list[Path]:
-    """Write the cameras, numbered from 1, as text or, for the suffix .bin, in binary."""
-    entries = []
+    """Write the cameras, numbered from 1, as text, in binary (.bin) or as a rig_config.json (.json).
+
+    With poses there is a `rigs.txt` or `rigs.bin` beside cameras.txt or cameras.bin, in which the first camera is the
+    reference sensor. COLMAP's `rig_configurator` takes the rig_config.json, with images in folders of the cameras.
+    """
+    entries, moves = [], []
     for number, camera in enumerate(cameras, 1):
-        _, kind, (fx, fy, cx, cy, _, *lens) = as_written(camera)
-        entries.append((number, WRITTEN[kind], camera.size, [fx, fy, cx + _HALF, cy + _HALF, *lens]))
-    if path.suffix.lower() == ".bin":
+        name, kind, (fx, fy, cx, cy, _, *lens) = as_written(camera, f"camera{number}")
+        entries.append((number, name, WRITTEN[kind], camera.size, [fx, fy, cx + _HALF, cy + _HALF, *lens]))
+        if poses:
+            step = poses[number - 1].after(poses[0].inverse())
+            moves.append([*foreign.quaternion_of(step.rotation), *foreign.plain(step.translation)])
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        parts: list[dict[str, Any]] = []
+        for number, name, kind, _, values in entries:
+            move = moves[number - 1] if moves and number > 1 else []
+            where = {"cam_from_rig_rotation": move[:4], "cam_from_rig_translation": move[4:]} if move else {}
+            parts.append({"image_prefix": f"{name}/", "camera_model_name": kind, "camera_params": values, **where})
+        parts[0]["ref_sensor"] = True
+        return [write_atomic(path, dump_json([{"cameras": parts}]))]
+    if suffix == ".bin":
         data = struct.pack("<Q", len(entries))
-        for number, name, size, values in entries:
-            data += struct.pack(f"<IiQQ{len(values)}d", number, COLMAP_MODELS[name].number, *size, *values)
-        return [write_atomic(path, data)]
+        for number, _, kind, size, values in entries:
+            data += struct.pack(f"<IiQQ{len(values)}d", number, COLMAP_MODELS[kind].number, *size, *values)
+        rig = struct.pack("<QIIiI", 1, 1, len(moves), 0, 1)
+        rig += b"".join(struct.pack("<iIB7d", 0, number, 1, *move) for number, move in enumerate(moves[1:], 2))
+        paths = [write_atomic(path, data)]
+        return paths + ([write_atomic(path.with_name("rigs.bin"), rig)] if moves else [])
     lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     lines.append(f"# Number of cameras: {len(entries)}")
-    for number, name, (width, height), values in entries:
-        lines.append(f"{number} {name} {width} {height} {' '.join(map(repr, values))}")
-    return [write_atomic(path, "\n".join(lines) + "\n")]
+    for number, _, kind, (width, height), values in entries:
+        lines.append(f"{number} {kind} {width} {height} {' '.join(map(repr, values))}")
+    paths = [write_atomic(path, "\n".join(lines) + "\n")]
+    if moves:
+        sensors = (f" CAMERA {number} 1 {' '.join(map(repr, move))}" for number, move in enumerate(moves[1:], 2))
+        paths.append(write_atomic(path.with_name("rigs.txt"), f"1 {len(moves)} CAMERA 1{''.join(sensors)}\n"))
+    return paths
 
 
 # nerfstudio's `transforms.json`: intrinsics of one camera, or of each frame. Pixel (0.5, 0.5) is the first center.

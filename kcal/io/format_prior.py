@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 import kcal.io.foreign as foreign
+from kcal.errors import InputError
 from kcal.files import read_bytes, write_atomic
 from kcal.io.format_photos import WRITTEN
 from kcal.lens.calibration import CameraCalibration
@@ -155,6 +156,46 @@ def read_prior(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
         if part.get("misfit_px")
     ]
     return foreign.ImportedCameras(format=program, cameras=cameras, notes=tuple(fitted))
+
+
+def ceres_prior(path: str | Path, camera: Any, *, pixel_sigma: float, number: int = 0) -> Any:
+    """A residual block of pyceres that holds a camera of COLMAP where `kcal export` has it, as firmly as it is known.
+
+    Args:
+        path: what `kcal export --format colmap` wrote beside the cameras, NAME.prior.json.
+        camera: of pycolmap; its `params` are the block's parameters.
+        pixel_sigma: standard deviation of the marks, px: COLMAP's residuals are pixels that are not divided by it.
+        number: which of the file's cameras, from 0.
+
+    Raises:
+        FileError: no such file, or none of kcal.
+        InputError: a camera of another model or size, one without error bars, or pyceres is missing.
+    """
+    try:
+        import pyceres
+    except ImportError:
+        raise InputError("ceres_prior needs pyceres: pip install pyceres") from None
+    with foreign.reading(path, "prior"):
+        prior = read_json(read_bytes(path, foreign.MOST_BYTES), str(path))["cameras"][number]
+        model, size, mean = str(prior["model"]), tuple(prior["size"]), np.array(prior["mean"], dtype=np.float64)
+    theirs = camera.model.name, (camera.width, camera.height)
+    if theirs != (model, size) or prior["sqrt_information"] is None:
+        raise InputError(f"ceres_prior: {path} is of {model} {size} with its error bars; the camera is {theirs}")
+    root = pixel_sigma * np.array(prior["sqrt_information"], dtype=np.float64)
+
+    class Prior(pyceres.CostFunction):
+        def __init__(self) -> None:
+            super().__init__()
+            self.set_num_residuals(len(mean))
+            self.set_parameter_block_sizes([len(mean)])
+
+        def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
+            residuals[:] = root @ (parameters[0] - mean)
+            if jacobians is not None and jacobians[0] is not None:
+                jacobians[0][:] = root.ravel()
+            return True
+
+    return Prior()
 
 
 def _from_archive(data: bytes, path: Path) -> dict[str, Any]:

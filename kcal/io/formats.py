@@ -117,6 +117,15 @@ FORMATS = {
         lenses=tuple(format_kalibr.KALIBR_LENSES),
         wide=True,
     ),
+    "basalt": CameraFormat(
+        title="Basalt calibration.json",
+        models=("pinhole", "opencv8", "fisheye4"),
+        read=format_kalibr.read_basalt,
+        write=format_kalibr.write_basalt,
+        poses=_ANY,
+        lenses=("ds", "eucm", "fov"),
+        wide=True,
+    ),
     "mrcal": CameraFormat(
         title="mrcal cameramodel, a file per camera",
         suffixes=(".cameramodel",),
@@ -126,13 +135,13 @@ FORMATS = {
         poses=_ANY,
     ),
     "colmap": CameraFormat(
-        title="COLMAP cameras.txt or cameras.bin",
+        title="COLMAP cameras.txt or cameras.bin with its rigs, or database",
         suffixes=(".txt", ".bin"),
         models=("pinhole", "opencv4", "opencv8", "fisheye4"),
         read=format_photos.read_colmap,
         write=format_photos.write_colmap,
+        poses=_ANY,
         lenses=("rad-tan-thin-prism", "eucm", "fov", "division"),
-        poses=0,
     ),
     "nerfstudio": CameraFormat(
         title="nerfstudio transforms.json",
@@ -166,6 +175,14 @@ FORMATS = {
         write=format_opencv.write_toml,
         poses=_ANY,
     ),
+    "multical": CameraFormat(
+        title="multical calibration.json",
+        models=tuple(OPENCV_MODELS.values()),
+        read=format_opencv.read_multical,
+        write=format_opencv.write_multical,
+        poses=_ANY,
+    ),
+    "calibio": CameraFormat(title="calib.io JSON", models=(), read=format_opencv.read_calibio, poses=0),
     "qualisys": CameraFormat(title="Qualisys .qca.txt", models=(), read=format_photos.read_qualisys, poses=0),
     "agisoft": CameraFormat(title="Agisoft Metashape XML", models=(), read=format_photos.read_agisoft, poses=0),
     "device": CameraFormat(
@@ -225,7 +242,8 @@ def recognized(path: Path) -> str:
     suffix = (path.with_suffix("") if path.suffix.lower() == ".gz" else path).suffix.lower()
     if file_kind(path) == "bag":
         return "bag"
-    read_head(path, 0)
+    if read_head(path, len(format_photos.SQLITE)) == format_photos.SQLITE:
+        return "colmap"
     if suffix in (".mat", ".cameramodel", ".bin"):
         return {".mat": "matlab", ".cameramodel": "mrcal", ".bin": "colmap"}[suffix]
     if suffix == ".npz":
@@ -284,14 +302,15 @@ def _json_format(path: Path, text: str) -> str:
 
 
 # Keys that JSON files of a format have, and of programs whose files are not read.
-_UNREAD = {"value0": "Basalt or cereal", "views": "Meshroom", "sfm_data_version": "OpenMVG"}
+_UNREAD = {"views": "Meshroom", "sfm_data_version": "OpenMVG"}
 _UNREAD_TEXT = {
     "OCamCalib": "^#polynomial coefficients for the DIRECT", "Bundler": r"\A# Bundle file", "VisualSFM": r"\ANVM_V3",
     "Hugin or PTGui": "^# (?:hugin|ptGui) project file", "Pix4D": r"\APix4D", "RealityCapture": r"\bxcr:",
     "DSO": r"\A(?:Pinhole|RadTan|EquiDistant|FOV|KannalaBrandt)(?:\s+[-+.\de]+){4}",
 }  # fmt: skip
 _JSON = {
-    "kcal": {"kcal"}, "ceres": {"kcal_prior"}, "nerfstudio": {"fl_x", "frames", "camera_angle_x"},
+    "kcal": {"kcal"}, "ceres": {"kcal_prior"}, "basalt": {"value0"}, "multical": {"camera_poses"},
+    "calibio": {"Calibration"}, "nerfstudio": {"fl_x", "frames", "camera_angle_x"},
     "matlab": {"RadialDistortion", "IntrinsicMatrix", "CameraParameters1"},
 }  # fmt: skip
 
@@ -305,10 +324,11 @@ def import_cameras(
 ) -> ImportedCameras:
     """Read cameras, and how they stand to each other, from files of other programs or of kcal.
 
-    OpenCV (YAML, XML; fisheye and omnidir, too), ROS camera_info and bags with it, Kalibr camchains and results, mrcal,
-    COLMAP, nerfstudio, MATLAB structs, OpenSfM, TOML of aniposelib, pose2sim and Caliscope, Qualisys, Agisoft
-    Metashape, devices and data sets (depthai, Azure Kinect, RealSense, ZED, EuRoC, KITTI, Open3D, nuScenes, DJI), and
-    kcal's priors for other programs. Error bars come with a camera where its file has them.
+    OpenCV (YAML, XML; fisheye and omnidir, too), ROS camera_info and bags with it, Kalibr camchains and results,
+    Basalt, mrcal, COLMAP with its rigs and databases, nerfstudio, MATLAB structs, OpenSfM, TOML of aniposelib, pose2sim
+    and Caliscope, multical, calib.io, Qualisys, Agisoft Metashape, devices and data sets (depthai, Azure Kinect,
+    RealSense, ZED, EuRoC, KITTI, Open3D, nuScenes, DJI), and kcal's priors for other programs. Error bars come with a
+    camera where its file has them.
     Principal points are converted to kcal's convention: (0, 0) is the center of the first pixel.
 
     Args:

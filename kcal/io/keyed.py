@@ -66,7 +66,7 @@ _PATTERNS = {role: re.compile(f"(?:cam(?:era)?)?(?:{names})") for role, (names, 
 _AFTER = re.compile(r"(.+?)(left|right|l|r|(?:cam(?:era)?)?[0-9])")
 # Lenses of OpenCV, its fisheye, what both may be called, and lenses that are neither.
 _PLAIN = re.compile(
-    "plumbbob|rational(?:polynomial)?|radtan8?|radialtangential|brown(?:conrady)?|opencv[0-9]*|standard|normal"
+    "plumbbob|rational(?:polynomial)?|radtan8?|radialtangential|brown(?:conrady)?|opencv[0-9]*|standard|normal|thinprism|tilted"
 )
 _FISHEYE = re.compile("fisheye|equi(?:distant)?|kannalabrandt[48]?|kb[48]?|opencvfisheye|fisheyeopencv")
 _EITHER = re.compile("|none|null|pinhole|perspective|camera|mono|monocular|stereo|central|rectified")

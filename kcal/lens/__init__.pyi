@@ -27,6 +27,7 @@ from kcal.lens.calibration import LensSetting as LensSetting
 
 # Other programs
 from kcal.io.formats import import_cameras as import_cameras
+from kcal.io.format_prior import ceres_prior as ceres_prior
 from kcal.calibrate.camera.export import export_cameras as export_cameras
 from kcal.io.lookup_file import save_onnx as save_onnx
 

@@ -3,8 +3,8 @@
     python -m scripts.check.exchange [--mrcal /usr/bin/python3] [--ros /usr/bin/python3] [--colmap PYTHON] [--write]
 
 The options name interpreters that have mrcal, ROS's camera_calibration_parsers and image_geometry, or pycolmap; without
-one its rows are left out. OpenCV and SciPy are read in this process. Where no reader of a program can be installed
-here, its published formula projects what PyYAML or json reads.
+one its rows stay as they are on the page. OpenCV and SciPy are read in this process. Where no reader of a program can
+be installed here, its published formula projects what PyYAML or json reads.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from kcal import Camera, Rig
 from kcal.lens import LensModel, camera_difference, export_cameras, import_cameras, rotation_from_vector
 from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
 from kcal.lens.zernike import ZernikeModes
-from scripts.shared.page import table, tell
+from scripts.check.foreign_lenses import by_formula
+from scripts.shared.page import rows_of_others, table, tell
 from scripts.shared.timing import show
 
 POINTS = 10_000
@@ -111,6 +112,9 @@ def by_opencv(path: Path, points: np.ndarray) -> np.ndarray:
 
 def by_kalibr(path: Path, points: np.ndarray) -> np.ndarray:
     camera = yaml.safe_load(path.read_text())["cam0"]
+    kind = "omni-radtan" if camera["camera_model"] == "omni" else camera["camera_model"]
+    if kind != "pinhole":
+        return by_formula("kalibr", kind, path, points)
     fu, fv, pu, pv = camera["intrinsics"]
     matrix = np.array([[fu, 0, pu], [0, fv, pv], [0, 0, 1]])
     fisheye = camera["distortion_model"] == "equidistant"
@@ -147,6 +151,22 @@ def by_opensfm(path: Path, points: np.ndarray) -> np.ndarray:
     return seen * max(c["width"], c["height"]) + (np.array([c["width"], c["height"]]) - 1) / 2
 
 
+def by_basalt(path: Path, points: np.ndarray) -> np.ndarray:
+    (lens,) = json.loads(path.read_text())["value0"]["intrinsics"]
+    if lens["camera_type"] in ("ds", "eucm"):
+        return by_formula("basalt", lens["camera_type"], path, points)
+    fx, fy, cx, cy, *terms = lens["intrinsics"].values()
+    fisheye = lens["camera_type"] == "kb4"
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    # What follows the eight of pinhole-radtan8 is the radius of its domain.
+    return opencv_formula(points, matrix, np.array(terms[:8]) if terms else np.zeros(4), fisheye)
+
+
+def by_multical(path: Path, points: np.ndarray) -> np.ndarray:
+    (camera,) = json.loads(path.read_text())["cameras"].values()
+    return opencv_formula(points, np.array(camera["K"]), np.array(camera["dist"]), False)
+
+
 def exact_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> list[list[str]]:
     """For each format, over the models that it holds: largest error of the peer, and of the way back to kcal."""
     from kcal.io.formats import FORMATS
@@ -170,18 +190,20 @@ def exact_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> li
 
 def fitted_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> list[list[str]]:
     """Lenses that formats do not hold: the stated maximum, and that of 10,000 points by the peer's reader."""
+    from kcal.io.formats import FORMATS
+
     rows = []
     subjects = {"hybrid, 72°": hybrid_camera(0.9, 36.0), "hybrid, 150°": hybrid_camera(0.2, 75.0)}
     for label, camera in (*subjects.items(), ("opencv14", sample_camera("opencv14"))):
         rays, pixels = random_points(camera, 1)
         far = 1e6 * rays
         for format_name, (file, _, project) in readers.items():
-            if label == "opencv14" and format_name == "opencv":
+            if label == "opencv14" and "opencv14" in FORMATS[format_name].models:
                 continue
             try:
                 done = export_cameras(camera, folder / file, format=format_name)
             except Exception as error:
-                rows.append([label, format_name, "refused", "", "", str(error).split(" (")[0][:40]])
+                rows.append([label, format_name, "refused", "", "", str(error).split(" (")[0][:40].strip()])
                 continue
             misfit = done.misfits[0]
             assert misfit is not None
@@ -279,6 +301,8 @@ def main() -> None:
         "nerfstudio": ("transforms.json", "json, cv2.projectPoints", by_nerfstudio),
         "matlab": ("camera.mat", "SciPy, MATLAB's documented formula", by_matlab),
         "opensfm": ("camera_models.json", "json, cv2.projectPoints", by_opensfm),
+        "basalt": ("basalt.json", "json, cv2.projectPoints", by_basalt),
+        "multical": ("multical.json", "json, cv2.projectPoints", by_multical),
     }
     if args.ros:
         name = "camera_calibration_parsers, cv2.projectPoints"
@@ -289,10 +313,12 @@ def main() -> None:
         readers["colmap"] = ("cameras.txt", "pycolmap", peer(args.colmap, "colmap"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        holds = table(["format", "models", "reader and projection", "peer, px", "back in kcal, px"],
-                      exact_rows(readers, folder))  # fmt: skip
+        heads = ["format", "models", "reader and projection", "peer, px", "back in kcal, px"]
+        others = rows_of_others("other-programs.md", "formats", 0, readers)
+        holds = table(heads, [*exact_rows(readers, folder), *others])
         heads = ["lens", "format", "fitted", "RMS, px", "stated maximum, px", "of 10,000 points; within"]
-        parts = {"formats": holds, "refitted": table(heads, fitted_rows(readers, folder))}
+        others = rows_of_others("other-programs.md", "refitted", 1, readers)
+        parts = {"formats": holds, "refitted": table(heads, [*fitted_rows(readers, folder), *others])}
         if args.mrcal:
             heads = ["kcal, RMS px", "mrcal, RMS px", "equal frames, px", "mrcal's turn, px", "own turns, px"]
             parts["difference"] = table(heads, difference_rows(folder, args.mrcal))

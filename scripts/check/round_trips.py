@@ -26,8 +26,10 @@ from kcal.io.formats import FORMATS
 from kcal.lens import CameraCalibration, export_cameras, import_cameras
 from scripts.check.exchange import (
     ask,
+    by_basalt,
     by_kalibr,
     by_matlab,
+    by_multical,
     by_nerfstudio,
     by_opencv,
     by_opensfm,
@@ -143,6 +145,8 @@ def out_rows(folder: Path, mrcal: str | None) -> Iterator[Row]:
         "matlab": ("m.mat", "SciPy, MATLAB's documented formula", by_matlab),
         "opensfm": ("camera_models.json", "json, cv2.projectPoints", by_opensfm),
         "colmap": ("cameras.txt", "pycolmap", by_pycolmap),
+        "basalt": ("basalt.json", "json, cv2.projectPoints", by_basalt),
+        "multical": ("multical.json", "json, cv2.projectPoints", by_multical),
         "gtsam": ("g.json", "gtsam", by_gtsam),
         "ceres": ("ceres.json", "json, cv2.projectPoints", by_ceres),
         "numpy": ("n.npz", "numpy, cv2.projectPoints", by_numpy),

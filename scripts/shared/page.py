@@ -56,6 +56,13 @@ def write_row(page: str, name: str, heads: Sequence[object], cells: Sequence[obj
     write_section(page, name, table(heads, rows))
 
 
+def rows_of_others(page: str, name: str, column: int, here: Iterable[str]) -> list[list[str]]:
+    """Rows of a table on a page whose cell in a column is none of those measured here: of programs that are missing."""
+    known = set(here)
+    found = [line.strip("| ").split(" | ") for line in read_section(page, name).splitlines()[2:]]
+    return [cells for cells in found if cells[column].strip() not in known]
+
+
 def table(heads: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]:
     """A Markdown table."""
     return [row(*heads), row(*["---"] * len(heads)), *(row(*cells) for cells in rows)]

@@ -254,4 +254,5 @@ def test_every_format_is_recognized_without_its_name(tmp_path: Path) -> None:
     for name, text in (("ros", ROS), ("kalibr", KALIBR), ("mrcal", MRCAL)):
         assert recognized(write(tmp_path, f"{name}.dat", text)) == name
     assert set(FORMATS) == {"opencv", "ros", "kalibr", "mrcal", "colmap", "nerfstudio", "matlab", "opensfm", "toml",
-                            "qualisys", "agisoft", "bag", "device", "gtsam", "ceres", "numpy"}  # fmt: skip
+                            "qualisys", "agisoft", "bag", "device", "gtsam", "ceres", "numpy", "basalt", "multical",
+                            "calibio"}  # fmt: skip

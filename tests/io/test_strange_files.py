@@ -373,7 +373,7 @@ TWO = {"image_size": [640, 480], "R": np.eye(3).tolist(), "T": [-60.0, 0, 0]}
 REFUSED: dict[str, tuple[str, Any, str]] = {
     # By name, by shape, and where two keys contradict each other.
     "Python objects": ("a.yaml", "K: !!python/object/apply:numpy.array []\n", "array.tolist"),
-    "Basalt": ("a.json", {"value0": {"intrinsics": []}}, "Basalt"),
+    "no Basalt": ("a.json", {"value0": {"frame": []}}, "bad basalt file: intrinsics is missing"),
     "turned": ("a.json", SIZE | {"K": K.T.tolist(), "D": D}, "exchange its rows and columns"),
     "no center": ("a.json", SIZE | {"fx": 500, "fy": 505, "k1": -0.1}, "cx and cy of the principal point are missing"),
     "none, but bent": ("a.yaml", ros("distortion_model: none"), "none, but there are coefficients"),

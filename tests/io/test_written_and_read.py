@@ -21,7 +21,7 @@ SUFFIXES = {
     "mrcal": (".cameramodel",),
     "matlab": (".mat",),
     "toml": (".toml",),
-    **dict.fromkeys(("nerfstudio", "opensfm", "gtsam", "ceres"), (".json",)),
+    **dict.fromkeys(("nerfstudio", "opensfm", "basalt", "multical", "gtsam", "ceres"), (".json",)),
     "numpy": (".npz",),
     "bag": (".bag", ".mcap", ".db3"),
     **dict.fromkeys(("ros", "kalibr"), (".yaml",)),
@@ -67,11 +67,13 @@ def test_one_camera(name: str, suffix: str, model: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [name for name, known in FORMATS.items() if known.poses and known.write])
 def test_a_pair(name: str, tmp_path: Path) -> None:
     """Turned about all axes, the right camera not beside the left one alone."""
-    model = "opencv5" if "opencv5" in FORMATS[name].models else "opencv4"
+    model = next(model for model in ("opencv5", "opencv4", "opencv8") if model in FORMATS[name].models)
     turn = rotation_from_vector(torch.tensor([0.02, -0.05, 0.03]).double())
     rig = Rig.pair(camera(model), camera(model, 5), turn, torch.tensor([-0.52, 0.013, -0.021]).double())
-    paths = FORMATS[name].write([rig.left, rig.right], rig_poses(rig), tmp_path / f"two{SUFFIXES[name][0]}")
-    found = [import_cameras(path, format=name) for path in paths]
+    stem = "cameras" if name == "colmap" else "two"
+    paths = FORMATS[name].write([rig.left, rig.right], rig_poses(rig), tmp_path / f"{stem}{SUFFIXES[name][0]}")
+    # COLMAP's second file has the rig.
+    found = [import_cameras(path, format=name) for path in paths[: 1 if name == "colmap" else 2]]
     cameras = [one for part in found for one in part.cameras]
     for got, wanted in zip(cameras, (rig.left, rig.right), strict=True):
         same(got, wanted)

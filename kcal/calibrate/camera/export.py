@@ -213,7 +213,8 @@ def export_cameras(
 
     The format follows from the suffix: `.yml`, `.yaml`, `.xml` OpenCV; `.cameramodel` mrcal; `.txt`, `.bin` COLMAP;
     `.json` nerfstudio; `.mat` MATLAB; `.toml` aniposelib; `.npz` maps for `cv2.remap`. Others are named: ros, kalibr,
-    opensfm, gtsam, ceres, numpy. Formats with one camera per file get NAME_left and NAME_right for a rig.
+    basalt, opensfm, multical, gtsam, ceres, numpy. Formats with one camera per file get NAME_left and NAME_right for a
+    rig.
 
     Cameras of one file get one lens model, the one that is nearest to all of them, with a note on those that would be
     nearer without the others. Kalibr's chains and Basalt's files hold lenses that are far off their pinhole and fisheye
