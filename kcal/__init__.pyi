@@ -24,11 +24,11 @@ from kcal.calibrate.rig.solve import calibrate_rig as calibrate_rig
 from kcal.calibrate.rig.solve import solve_rig as solve_rig
 from kcal.calibrate.rig.solve import RigOptions as RigOptions
 from kcal.calibrate.rig.sources import RigData as RigData
-from kcal.calibrate.rig.boards import Boards as Boards
-from kcal.calibrate.rig.landmarks import Landmarks as Landmarks
-from kcal.calibrate.rig.features import Features as Features
-from kcal.calibrate.rig.measured import Baseline as Baseline
-from kcal.calibrate.rig.measured import MeasuredPosition as MeasuredPosition
+from kcal.calibrate.rig.sources import Boards as Boards
+from kcal.calibrate.rig.marks import Landmarks as Landmarks
+from kcal.calibrate.rig.marks import Features as Features
+from kcal.calibrate.rig.sources import Baseline as Baseline
+from kcal.calibrate.rig.sources import MeasuredPosition as MeasuredPosition
 
 # Locate
 from kcal.locate.localizer import Localizer as Localizer

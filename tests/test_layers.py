@@ -234,7 +234,7 @@ def test_planted_violations_are_seen(module: str, source: str, complaint: str) -
     [
         ("kcal.cli.demo", "import kcal\nfrom kcal.sim.scene import demo_rig\nprint(kcal.Camera(1))"),
         ("kcal.corners.detect", "from kcal.opencv import cv2\nfrom kcal.corners.board import Board"),
-        ("kcal.calibrate.camera.solve", "from kcal.calibrate.problem.poses import refine_poses\nfrom . import options"),
+        ("kcal.calibrate.camera.solve", "from kcal.calibrate.problem.views import refine_poses\nfrom . import options"),
         ("kcal.sim.scene", "from kcal.lens.camera import Camera\nfrom kcal.checks import as_points"),
         ("kcal.io.camera_file", "import kcal\nimport skimage.io\nprovenance = kcal.__version__"),
         ("kcal.solve.lm", "x = 1\n" * 700),

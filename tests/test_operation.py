@@ -13,7 +13,7 @@ from whole_graphs import traced_whole
 
 from kcal import Camera, Localizer, Origin, Rig
 from kcal.lens import LensModel, Unproject
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate import Triangulate
 from kcal.nets import NetworkModes

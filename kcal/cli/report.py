@@ -26,8 +26,8 @@ from kcal.table import Table
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from kcal.calibrate.camera.interval_check import IntervalCheck, Refit
     from kcal.calibrate.camera.result import CameraCalibrationResult
+    from kcal.calibrate.camera.trust import IntervalCheck, Refit
     from kcal.calibrate.rig.result import RigResult
     from kcal.finding import Finding
     from kcal.report.verdict import Verdict
@@ -311,7 +311,7 @@ def check_command(
     name = camera.name.removesuffix(".json").removesuffix(".camera")
     kept = check_writable(output or camera.with_name(f"{name}.check.npz"), camera)
 
-    from kcal.calibrate.camera.interval_check import FEWEST, interval_check
+    from kcal.calibrate.camera.trust import FEWEST, interval_check
 
     at = distance or [math.inf]
     result, options, fingerprint = _calibration_of(camera, observations)
@@ -340,7 +340,7 @@ def check_command(
 def _check_ranges(path: Path, ranges: Path, marks: Path | None, sigma: float | None) -> None:
     """Print known and measured ranges, and whether they agree."""
     from kcal.io.rig_file import load_pair
-    from kcal.locate.range_check import check_ranges, read_known_ranges
+    from kcal.locate.budget import check_ranges, read_known_ranges
 
     rig, points = load_pair(path), read_known_ranges(ranges, marks)
     noise, note = pixel_sigma_and_source(sigma, rig)
@@ -399,7 +399,7 @@ def _all_refits(
     path: Path,
 ) -> tuple[list[Refit], bool]:
     """So many refits, those of an earlier run included; and whether these are all."""
-    from kcal.calibrate.camera.interval_check import GRID, simulated_refits
+    from kcal.calibrate.camera.trust import GRID, simulated_refits
 
     # That of the file: a calibration that is made again differs in the last digits.
     text = repr((fingerprint, [view.pixels for view in result.observations.views], ranges, GRID))
@@ -439,7 +439,7 @@ def _kept_refits(path: Path, key: str) -> list[Refit]:
     """The refits of an earlier run; none where the file is of another camera, other ranges or another version."""
     import torch
 
-    from kcal.calibrate.camera.interval_check import Refit
+    from kcal.calibrate.camera.trust import Refit
     from kcal.strict_formats import read_npz
 
     if not path.exists():
@@ -511,7 +511,7 @@ def _told_against(
     result: CameraCalibrationResult, path: Path, options: kcal.CalibrationOptions, ranges: list[float]
 ) -> bool:
     """Print whether a second capture gives the same camera."""
-    from kcal.calibrate.camera.interval_check import against_capture
+    from kcal.calibrate.camera.trust import against_capture
     from kcal.report.calibration import range_label
 
     second = kcal.Observations.load(path)

@@ -163,7 +163,7 @@ def solve_and_write(
 
     The rig is written; it is printed how each camera stands, and whether the rig may be used.
     """
-    from kcal.locate.mirrored import solve_surveyed
+    from kcal.locate.survey import solve_surveyed
 
     two = len(paths) == 2
     names = camera_names(paths, told_apart=not two)

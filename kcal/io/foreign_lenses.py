@@ -18,8 +18,7 @@ import kcal.io.foreign as foreign
 from kcal.errors import DegenerateError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
-from kcal.lens.model import LensModel
+from kcal.lens.model import HybridForm, LensModel, radius_over_angle
 from kcal.lens.projection import angle_over_distance, project_components
 from kcal.lens.zernike import ZernikeModes
 

@@ -18,9 +18,8 @@ from torch import Tensor, nn
 from kcal.checks import as_covariance
 from kcal.errors import InputError
 from kcal.lens.field_modes import SLOPES, FieldModes, GaussianModes, NetworkModes, known_chain, network_names
-from kcal.lens.hybrid_terms import LEADING, PORT, HybridForm
 from kcal.lens.information import CameraInformation
-from kcal.lens.model import LensModel
+from kcal.lens.model import LEADING, PORT, HybridForm, LensModel
 from kcal.lens.zernike import ZernikeModes
 from kcal.native_file import Record
 
@@ -312,7 +311,7 @@ _KINDS: dict[str, type] = {"modes": ZernikeModes, "gaussian": GaussianModes, "ne
 
 
 class HybridRecord(Record):
-    """The constants of a hybrid lens (`kcal.lens.hybrid_terms.HybridForm`).
+    """The constants of a hybrid lens (`kcal.lens.model.HybridForm`).
 
     Args:
         shape: of the base projection.

@@ -16,10 +16,9 @@ from kcal.doors import shown_in_notebooks
 from kcal.errors import InputError
 from kcal.lens.camera_conversions import ConvertibleCamera
 from kcal.lens.camera_parameters import CameraDistortion, ExtendedDistortion
-from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_points import FittedPolynomials, map_points, worth_fitting
 from kcal.lens.inverse import InverseStart, PreparedInverse, undistort_components
-from kcal.lens.model import LensModel, larger_model
+from kcal.lens.model import LensModel, distort_components, larger_model
 from kcal.lens.projection import (
     FAR,
     INTRINSICS,

@@ -13,9 +13,8 @@ from torch import Tensor, nn
 from kcal.checks import StatedModule, as_points, as_size, require_finite
 from kcal.dispatch import finite_or
 from kcal.errors import InputError
-from kcal.lens.distortion import distort_components
 from kcal.lens.inverse import InverseStart, PreparedInverse, prepare_inverse, undistort
-from kcal.lens.model import LensModel
+from kcal.lens.model import LensModel, distort_components
 from kcal.lens.projection import parameter_names
 from kcal.lens.region import Region, in_region
 from kcal.operation import Operations

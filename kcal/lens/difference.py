@@ -10,8 +10,8 @@ from torch import Tensor
 
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
+from kcal.lens.pose import fit_turn, rotation_between, seen_turned
 from kcal.lens.projection import FAR
-from kcal.lens.turning import fit_turn, rotation_between, seen_turned
 from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
 from kcal.texts import brief, length_text, number_text, range_text
 

@@ -13,10 +13,8 @@ from numpy.polynomial import chebyshev
 from torch import Tensor
 
 from kcal.dispatch import is_traced, may_overwrite
-from kcal.lens.distortion import distort_components
-from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.inverse import PreparedInverse, inverse_jacobian, undistort_components
-from kcal.lens.model import LensModel
+from kcal.lens.model import HybridForm, LensModel, distort_components
 from kcal.lens.projection import INTRINSICS, plane_from_points, pupil_depth, ray_starts, rays_from_plane, to_pixels
 from kcal.lens.region import SURE, Region
 from kcal.lens.zernike import ZernikeModes

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from kcal.checks import as_points
 from kcal.dispatch import finite_or, in_chunks, is_differentiated, known_true, may_branch
-from kcal.lens.distortion import check_coefficients, distort_components, polynomial
-from kcal.lens.model import LensModel
+from kcal.lens.model import LensModel, check_coefficients, distort_components, polynomial
 from kcal.lens.region import DIRECTIONS, SECTORS, Region, direction_limits, in_region, valid_region
 from kcal.lens.zernike import unbind_last
 

@@ -10,9 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.dispatch import is_differentiated, is_traced, known_true, may_overwrite
-from kcal.lens.distortion import as_columns, distort_components
-from kcal.lens.hybrid_terms import angle_over_radius, radius_over_angle, series
-from kcal.lens.model import LensModel
+from kcal.lens.model import LensModel, angle_over_radius, as_columns, distort_components, radius_over_angle, series
 from kcal.lens.zernike import unbind_last
 
 # Map points to the plane on which the lens terms act, the first stage of a camera, and back to rays.

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from kcal.dispatch import known_true, may_branch
-from kcal.lens.distortion import Distorted, check_coefficients, distort_components
-from kcal.lens.model import LensModel
+from kcal.lens.model import Distorted, LensModel, check_coefficients, distort_components
 from kcal.lens.projection import largest_radius
 from kcal.lens.zernike import unbind_last
 from kcal.texts import briefly

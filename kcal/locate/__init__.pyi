@@ -8,12 +8,12 @@ from kcal.locate.export import write_positions as write_positions
 
 # Triangulate
 from kcal.locate.triangulate import Triangulate as Triangulate
-from kcal.locate.disparity import DisparityRanges as DisparityRanges
+from kcal.locate.triangulate import DisparityRanges as DisparityRanges
 
 # Points on the ground
 from kcal.locate.ground import locate_on_ground as locate_on_ground
 from kcal.locate.ground import level_ground as level_ground
-from kcal.locate.raster import terrain as terrain
+from kcal.locate.ground import terrain as terrain
 
 # Where to put the next camera
 from kcal.locate.siting import area_of as area_of
@@ -29,4 +29,4 @@ from kcal.locate.tabulate import find_geoid as find_geoid
 # Range errors of a rig
 from kcal.locate.budget import range_errors as range_errors
 from kcal.locate.budget import BudgetErrors as BudgetErrors
-from kcal.locate.range_check import check_ranges as check_ranges
+from kcal.locate.budget import check_ranges as check_ranges

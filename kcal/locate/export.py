@@ -193,8 +193,7 @@ def _cut(ring: list[tuple[float, float]]) -> dict[str, Any]:
 
 
 def _feature(geometry: dict[str, Any] | None, properties: dict[str, Any]) -> bytes:
-    feature = {"type": "Feature", "geometry": geometry, "properties": properties}
-    return orjson.dumps(feature)
+    return orjson.dumps({"type": "Feature", "geometry": geometry, "properties": properties})
 
 
 def _json_value(cell: str) -> object:
@@ -202,31 +201,24 @@ def _json_value(cell: str) -> object:
     if not cell:
         return None
     number = _JSON_NUMBER.fullmatch(cell)
-    # One beyond float64 is none for programs that read it.
-    if number and (_is_exact(cell) if not (number[2] or number[3]) else math.isfinite(float(cell))):
-        return orjson.Fragment(cell)
-    return cell
-
-
-def _is_exact(digits: str) -> bool:
-    """Of a whole number; Python refuses to read one of thousands of digits."""
-    return len(digits) <= len(str(-_LARGEST_WHOLE)) and abs(int(digits)) <= _LARGEST_WHOLE
+    if number and not (number[2] or number[3]):
+        # Python refuses to read whole numbers of thousands of digits.
+        exact = len(cell) <= len(str(-_LARGEST_WHOLE)) and abs(int(cell)) <= _LARGEST_WHOLE
+    else:
+        # One beyond float64 is none for programs that read it.
+        exact = number is not None and math.isfinite(float(cell))
+    return orjson.Fragment(cell) if exact else cell
 
 
 # Positions as Cursor-on-Target events, the XML of ATAK, WinTAK and their kin.
 
-COT_END = "</events>\n"
+COT_START, COT_END = '<?xml version="1.0" encoding="UTF-8"?>\n<events>\n', "</events>\n"
 # What Cursor-on-Target writes for a number that is not known.
 _UNKNOWN = "9999999.0"
 # Unknown affiliation, on the ground: kcal says where, not what.
 _TYPE = "a-u-G"
 # Machine-generated, estimated.
 _HOW = "m-g"
-
-
-def cot_start() -> str:
-    """The beginning of the document."""
-    return '<?xml version="1.0" encoding="UTF-8"?>\n<events>\n'
 
 
 def cot_events(columns: PositionColumns, run: Located, *, time: datetime | None = None, stale_s: float = 300.0) -> str:
@@ -373,7 +365,7 @@ _FORMATS = {
         KML_END.encode(),
     ),
     ".cot": _Format(
-        lambda run, columns: cot_start().encode(),
+        lambda run, columns: COT_START.encode(),
         lambda run, columns, time: cot_events(columns, run, time=time).encode(),
         end=COT_END.encode(),
     ),

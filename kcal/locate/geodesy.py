@@ -64,20 +64,16 @@ def ecef_to_geodetic(ecef: Tensor) -> Tensor:
         >>> bool(torch.allclose(ecef_to_geodetic(geodetic_to_ecef(place)), place, rtol=1e-14))
         True
     """
-    return torch.stack(geodetic_components(*as_points("ecef", ecef, 3).unbind(-1)), -1)
-
-
-def geodetic_components(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Latitude, longitude, height of ECEF coordinates that are given one by one; see `ecef_to_geodetic`."""
+    x, y, z = as_points("ecef", ecef, 3).unbind(-1)
     lat, lon, distance = _angles(x, y, z)
     sine, cosine = torch.sin(lat), torch.cos(lat)
     # p cos φ + z sin φ - a √(1 - e² sin² φ) needs no division by a cosine that is zero at the poles.
     height = distance * cosine + z * sine - SEMI_MAJOR * torch.sqrt(1.0 - _E2 * sine * sine)
-    return lat * _DEGREES, lon * _DEGREES, height
+    return torch.stack([lat * _DEGREES, lon * _DEGREES, height], -1)
 
 
 def latitude_longitude(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-    """The same without the height, degrees."""
+    """The same of coordinates that are given one by one, without the height, degrees."""
     lat, lon, _ = _angles(x, y, z)
     return lat * _DEGREES, lon * _DEGREES
 

@@ -163,7 +163,9 @@ def most_likely(
     with torch.no_grad():
         theta = torch.stack([zero, zero, first], -2)
         best, step, cost = theta, torch.zeros_like(theta), torch.full_like(zero, torch.inf)
-        length, noise = torch.full_like(zero, torch.inf), _least_noise(weight)
+        # A lower bound of the pixels' noise.
+        noise = 1.0 if weight is None else weight.diagonal(dim1=-3, dim2=-2).amax(-1).clamp_min(1e-30).rsqrt()
+        length = torch.full_like(zero, torch.inf)
         for number in range(_TRACED_STEPS if is_traced() else _MOST_STEPS):
             # An exported graph must have no change of mode without any operation: it could not be loaded.
             with torch.enable_grad() if recorded and number else contextlib.nullcontext():
@@ -205,11 +207,6 @@ def most_likely(
             theta = theta - torch.where(usable[..., None, :], _product(inverse, at.slope), 0.0)
     at = _evaluate(whole, theta)
     return _fit_at(at, theta, sides, _covariance_at(at, fixed))
-
-
-def _least_noise(weight: Tensor | None) -> Tensor | float:
-    """A lower bound of the pixels' noise."""
-    return 1.0 if weight is None else weight.diagonal(dim1=-3, dim2=-2).amax(-1).clamp_min(1e-30).rsqrt()
 
 
 def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
@@ -277,12 +274,8 @@ def _normal_matrix(at: _Evaluated, fixed: _Fixed) -> Six:
 
 def _covariance_at(at: _Evaluated, fixed: _Fixed) -> Six:
     """Of (a, b, ρ), from the noise of the pixels."""
-    return _inverse_of_six(_normal_matrix(at, fixed))
-
-
-def _inverse_of_six(m: Six) -> Six:
-    """Of symmetric positive 3x3 matrices, by their adjugate; zero where the determinant vanishes."""
-    a, b, c, d, e, f = m
+    # By the adjugate; zero where the determinant vanishes.
+    a, b, c, d, e, f = _normal_matrix(at, fixed)
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * A + b * B + c * C
     regular = determinant > 0

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import Akima1DInterpolator, BSpline, make_smoothing_spline
 from torch import Tensor
 
-from kcal.calibrate.rig.landmarks import Landmarks
-from kcal.calibrate.rig.measured import MeasuredPosition
+from kcal.calibrate.rig.marks import Landmarks
 from kcal.calibrate.rig.resection import consensus_pose, consensus_rotation
 from kcal.calibrate.rig.source import Effect
+from kcal.calibrate.rig.sources import MeasuredPosition
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin
@@ -436,23 +436,19 @@ def match_moving(
         ('drone', 0.5, 25)
     """
     options = options or MovingOptions()
-    seen = [_searched(sighting, cameras[sighting.camera]) for sighting in sightings]
-    seen = [one for one in seen if len(one.times)]
+    ordered = sorted(sightings, key=lambda sighting: sighting.camera)
+    seen = [one for own in ordered if len((one := _searched(own, cameras[own.camera])).times)]
     near = {p.camera: p.point for p in positions}
     clock = _clock(tracks, seen, near, options.clock_sigma)
     identities: list[Identity] = []
     for camera in sorted({one.sighting.camera for one in seen}):
         own = [one for one in seen if one.sighting.camera == camera]
         identities += _identities(tracks, own, near.get(camera), clock, names[camera])
-    matched = [(one, name.track) for one, name in zip(_camera_by_camera(seen), identities, strict=True) if name.track]
+    matched = [(one, name.track) for one, name in zip(seen, identities, strict=True) if name.track]
     if not matched:
         raise InputError("none of the sightings follows a track: check times, names and the cameras' positions")
     landmarks = _moving_landmarks(tracks, matched, len(cameras), names, clock, options)
     return MovingControl(landmarks, tuple(identities), clock)
-
-
-def _camera_by_camera(seen: Sequence[_Seen]) -> list[_Seen]:
-    return sorted(seen, key=lambda one: one.sighting.camera)
 
 
 def _searched(sighting: Sighting, camera: Camera) -> _Seen:
@@ -460,13 +456,6 @@ def _searched(sighting: Sighting, camera: Camera) -> _Seen:
     some = valid.nonzero()[:, 0]
     some = some[torch.linspace(0, len(some) - 1, min(_MOMENTS, len(some))).round().long()] if len(some) else some
     return _Seen(sighting, sighting.times[some], rays[some])
-
-
-def _in_common(track: MovingTrack, seen: _Seen, clock: float) -> tuple[Tensor, Tensor]:
-    """Rays (M, 3) and points (M, 3) at the times that the track knows."""
-    points = track.at(seen.times + clock).points
-    known = torch.isfinite(points).all(-1)
-    return seen.rays[known], points[known]
 
 
 def _claims(tracks: Sequence[MovingTrack], seen: Sequence[_Seen]) -> list[tuple[_Seen, MovingTrack]]:
@@ -482,10 +471,12 @@ def _agreed_pose(
     pairs: Sequence[tuple[_Seen, MovingTrack]], near: Tensor | None, clock: float
 ) -> tuple[Tensor, Tensor, float] | None:
     """Rotation, center and mean score of the pose that most of the pairs agree on."""
-    parts = [_in_common(track, one, clock) for one, track in pairs]
-    if not parts:
+    if not pairs:
         return None
-    rays, points = (torch.cat(part) for part in zip(*parts, strict=True))
+    rays = torch.cat([one.rays for one, _ in pairs])
+    points = torch.cat([track.at(one.times + clock).points for one, track in pairs])
+    known = torch.isfinite(points).all(-1)
+    rays, points = rays[known], points[known]
     if len(rays) < (2 if near is not None else 4):
         return None
     if near is not None:

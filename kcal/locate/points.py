@@ -177,7 +177,10 @@ class PointLocator:
         extras = dict(marks.extras) | {
             "cameras": [_camera_list(rig, row) for row in found.used.tolist()],
             "left_out": [_camera_list(rig, row) for row in found.bad.tolist()],
-            "misfit_sigmas": [_misfits(rig, row) for row in found.misfit.tolist()],
+            "misfit_sigmas": [
+                " ".join(f"{name}={value:.1f}" for name, value in zip(rig.names, row, strict=True) if value > 0)
+                for row in found.misfit.tolist()
+            ],
         }
         reasons = _view_reasons(rig, found)
         columns = PositionColumns(marks.names, found.status.numpy(), reasons, self._numbers(own, []), extras)
@@ -261,10 +264,6 @@ def _pair_reason(status: PositionStatus, found: Localization, i: int, baseline: 
 
 def _camera_list(rig: Rig, which: Sequence[bool]) -> str:
     return " ".join(name for name, one in zip(rig.names, which, strict=True) if one)
-
-
-def _misfits(rig: Rig, row: Sequence[float]) -> str:
-    return " ".join(f"{name}={value:.1f}" for name, value in zip(rig.names, row, strict=True) if value > 0)
 
 
 def _view_reasons(rig: Rig, found: Localization) -> list[str]:

@@ -26,7 +26,7 @@ from kcal.locate.localizer import Localizer
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.survey import read_survey
 from kcal.locate.tables import NUMBERS, PositionColumns
-from kcal.locate.tabulate import Viewpoint
+from kcal.locate.tabulate import Viewpoint, covariance_root
 from kcal.texts import brief
 
 # Why there are neither maps nor latitudes, and the cure.
@@ -229,7 +229,7 @@ def _level_outline(place: Tensor, spread: Tensor, share: float, plain: bool = Fa
     wide = (squared == 0) | (reach * along.sqrt() > _TOO_WIDE * squared) | plain
     still = torch.eye(2, dtype=torch.float64)
     slope = (still - 2.0 * place[..., :, None] * place[..., None, :] / some[..., None, None]) / some[..., None, None]
-    root = _covariance_root(torch.where(wide[..., None, None], spread, slope @ spread @ slope.mT))
+    root = covariance_root(torch.where(wide[..., None, None], spread, slope @ spread @ slope.mT))
     middle = torch.where(wide[..., None], place, place / some[..., None])
     # The inversion turns the sense of rotation, and the root may.
     clockwise = (torch.linalg.det(root) > 0) != wide
@@ -240,11 +240,6 @@ def _level_outline(place: Tensor, spread: Tensor, share: float, plain: bool = Fa
     north = middle[..., 1:] + root[..., 1:, 0] * cosine + root[..., 1:, 1] * sine
     length = torch.where(wide[..., None], 1.0, (east * east + north * north).clamp_min(1e-300))
     return east / length, north / length
-
-
-def _covariance_root(matrix: Tensor) -> Tensor:
-    values, vectors = torch.linalg.eigh(matrix)
-    return vectors * values.clamp_min(0.0).sqrt()[..., None, :]
 
 
 def region_rings(located: Located) -> list[Ring]:

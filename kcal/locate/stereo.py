@@ -149,24 +149,17 @@ def checked_mask(mask: Tensor, shape: tuple[int, ...], device: torch.device) -> 
     return expanded("mask", mask, shape)
 
 
-class CheckedViews(NamedTuple):
-    """Pixels (..., V, 2) and which are seen (..., V)."""
-
-    pixels: Tensor
-    seen: Tensor
-
-
-def checked_views(pixels: Tensor | ArrayLike, seen: Tensor | None, count: int, like: Tensor) -> CheckedViews:
+def checked_views(pixels: Tensor | ArrayLike, seen: Tensor | None, count: int, like: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels as float64 (..., V, 2) and which of them are seen, after checking types and shapes."""
     pixels = as_points("pixels", pixels, 2, like)
     if pixels.ndim < 2 or pixels.shape[-2] != count:
         raise InputError(f"pixels: shape (..., {count}, 2) is needed, got {tuple(pixels.shape)}")
     if seen is None:
-        return CheckedViews(pixels, torch.ones(pixels.shape[:-1], dtype=torch.bool, device=pixels.device))
+        return pixels, torch.ones(pixels.shape[:-1], dtype=torch.bool, device=pixels.device)
     seen = torch.as_tensor(seen, device=pixels.device)
     if seen.dtype != torch.bool:
         raise InputError(f"seen: bool is needed, got {seen.dtype}")
-    return CheckedViews(pixels, expanded("seen", seen, pixels.shape[:-1]))
+    return pixels, expanded("seen", seen, pixels.shape[:-1])
 
 
 def checked_views_covariance(cov: Tensor | None, pixels: Tensor) -> Tensor | None:

@@ -411,7 +411,10 @@ def read_chunks(
             if by_column is None:
                 rows, beyond = _split_any(path, texts, texts_of, lines[0] - 1)
                 line += beyond
-                _check_widths(path, rows, len(names))
+                for end, cells in rows:
+                    if len(cells) != len(names):
+                        text = f"{len(cells)} fields, the header has {len(names)}: {','.join(cells)}"
+                        raise FileError(f"{path}: line {end}: {text}")
                 by_column = {name: [cells[place] for _, cells in rows] for place, name in enumerate(names)}
                 lines = [end for end, _ in rows]
             if not lines:
@@ -421,7 +424,9 @@ def read_chunks(
                     by_column[name] = list(map(_unguarded, cells))
             own = by_column.get("name", [str(count + i) for i in range(1, len(lines) + 1)])
             if "name" in by_column and unique:
-                _check_filled(path, own, lines)
+                if "" in own:
+                    where = f"{path}: line {lines[own.index('')]}"
+                    raise FileError(f"{where}: the name is empty; write one or leave the column out")
                 _refuse_doubled(path, earlier.add(own))
             count += len(lines)
             yield TableChunk(path, lines, own, by_column, read)
@@ -475,10 +480,6 @@ def _bytes_read(file: TextIOWrapper) -> int:
     return os.lseek(file.fileno(), 0, os.SEEK_CUR)
 
 
-def _csv_reader(texts: Iterable[str]) -> Any:
-    return csv.reader(texts, strict=True, skipinitialspace=True)
-
-
 def _stripped(cells: list[str]) -> list[str]:
     return [cell.strip() for cell in cells]
 
@@ -504,7 +505,7 @@ def _split_any(path: Path, texts: list[str], file: Iterator[str], line: int) -> 
     """Rows that are not blank, each with the line on which it ends, and how many lines beyond `texts` the last took."""
     if any("\0" in text for text in texts):
         raise FileError(f"{path}: not a text file; save it as CSV in UTF-8")
-    reader = _csv_reader(itertools.chain(texts, file))
+    reader = csv.reader(itertools.chain(texts, file), strict=True, skipinitialspace=True)
     rows = []
     try:
         for cells in map(_stripped, reader):
@@ -530,19 +531,6 @@ def guarded(text: str) -> str:
 def _unguarded(text: str) -> str:
     """The text before `csv_line` put an apostrophe in front, so that no spreadsheet takes it for a formula."""
     return text[1:] if text.startswith("'") and _GUARDED.match(text) and not is_number(text[1:]) else text
-
-
-def _check_widths(path: Path, rows: Sequence[tuple[int, list[str]]], width: int) -> None:
-    for line, cells in rows:
-        if len(cells) != width:
-            text = ",".join(cells)
-            raise FileError(f"{path}: line {line}: {len(cells)} fields, the header has {width}: {text}")
-
-
-def _check_filled(path: Path, names: Sequence[str], lines: Sequence[int]) -> None:
-    if "" in names:
-        where = f"{path}: line {lines[names.index('')]}"
-        raise FileError(f"{where}: the name is empty; write one or leave the column out")
 
 
 def _refuse_doubled(path: Path, found: Doubled | None) -> None:

@@ -321,8 +321,7 @@ def _sampled(enu: Tensor, covariance: Tensor, shares: tuple[float, ...]) -> Tens
     # The derivative of X / |X|² by X: a reflection along X, over |X|².
     direction = enu / squared.sqrt()[:, None]
     slope = (still - 2.0 * direction[:, :, None] * direction[:, None, :]) / squared[:, None, None]
-    values, vectors = torch.linalg.eigh(slope @ covariance @ slope.mT)
-    factor = vectors * values.clamp_min(0.0).sqrt()[:, None, :]
+    factor = covariance_root(slope @ covariance @ slope.mT)
     inverted = enu / squared[:, None]
     samples = inverted[:, None, :] + _standard_normal(enu.device) @ factor.mT
     ahead = (samples * direction[:, None, :]).sum(-1) > 0
@@ -330,6 +329,12 @@ def _sampled(enu: Tensor, covariance: Tensor, shares: tuple[float, ...]) -> Tens
     distance = torch.linalg.vector_norm((points - enu[:, None, :])[..., :2], dim=-1)
     ordered = torch.where(ahead, distance, torch.inf).sort(-1).values
     return ordered[:, [min(_DRAWS - 1, round(share * _DRAWS)) for share in shares]]
+
+
+def covariance_root(matrix: Tensor) -> Tensor:
+    """(..., P, P) root with root rootᵀ = matrix, negative eigenvalues by rounding taken as zero."""
+    values, vectors = torch.linalg.eigh(matrix)
+    return vectors * values.clamp_min(0.0).sqrt()[..., None, :]
 
 
 @functools.lru_cache(maxsize=2)

@@ -489,14 +489,6 @@ def reach_of(found: ViewsFit, variance: Tensor, weak_status: PositionStatus, beh
     return Reach(value, sigma, interval, weak, code)
 
 
-def posed_pair(rig: Rig) -> PosedCameras:
-    """Both cameras in the left one's frame."""
-    rotation, shift = rig.right_from_left_rotation, rig.right_from_left_translation
-    still = torch.eye(3, dtype=torch.float64, device=rotation.device)
-    centers = torch.stack([torch.zeros_like(shift), -shift @ rotation])
-    return PosedCameras([rig.left, rig.right], torch.stack([still, rotation]), centers)
-
-
 def errors_by_camera(rig: Rig, root: Tensor | None) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:
     """What `CommonErrors` contains: `half`, `bending` per unit of k, and `lens`."""
     if root is None or not bool(root.any()):

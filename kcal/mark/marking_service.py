@@ -20,12 +20,11 @@ from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
 from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks
-from kcal.locate.mirrored import solve_surveyed
 from kcal.locate.mounting import placed_rig
 from kcal.locate.points import locate_points
 from kcal.locate.positions import Located, Position, near, region_rings
 from kcal.locate.stereo import PositionStatus
-from kcal.locate.survey import Survey, match_landmarks, read_survey
+from kcal.locate.survey import Survey, match_landmarks, read_survey, solve_surveyed
 from kcal.mark.guide import Pictures, Proposal, Reference, RigBand, at_shape, propose, top_level
 from kcal.mark.items import SIDES, Change, Coordinate, Item, Mark, MarkingState, Number, Put, Side, Step, other_side
 from kcal.mark.session import Session, marks_of, pair_covariance

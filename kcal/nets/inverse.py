@@ -21,8 +21,7 @@ from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.inverse import start_from, undo_tilt
 from kcal.lens.projection import from_pixels, plane_from_points, rays_from_plane
-from kcal.solve.lm import DenseLinearization, DenseProblem, LMOptions, minimize
-from kcal.solve.problem import Problem, Result, SolverStatus, State
+from kcal.solve.lm import DenseLinearization, DenseProblem, LMOptions, Problem, Result, SolverStatus, State, minimize
 from kcal.texts import brief
 
 # Small fully connected networks as functions of one vector of weights, with closed-form Jacobians.

@@ -24,8 +24,7 @@ from kcal.nets.inverse import (
     judged_inverse,
     set_scales,
 )
-from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.problem import SolverStatus, State
+from kcal.solve.lm import LMOptions, SolverStatus, State, minimize
 from kcal.solve.schur import SchurProblem
 from kcal.texts import brief
 

@@ -22,7 +22,7 @@ from kcal.calibrate.camera.advice import reached, unreached_share
 from kcal.calibrate.camera.at_setting import ComparisonResult
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.calibrate.camera.export import Misfit
-from kcal.calibrate.camera.interval_check import IntervalCheck
+from kcal.calibrate.camera.trust import IntervalCheck
 from kcal.calibrate.hybrid.measured_board import Measured, MeasuredBoard
 from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.problem.poses import poses_under
-from kcal.calibrate.problem.views import Views
+from kcal.calibrate.problem.views import Views, poses_under
 from kcal.calibrate.rig.result import RigResult
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError

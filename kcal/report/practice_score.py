@@ -19,8 +19,8 @@ from torch import Tensor
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 from kcal.lens.camera import Camera
+from kcal.lens.pose import rotation_between
 from kcal.lens.rig import Origin, Rig
-from kcal.lens.turning import rotation_between
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.localizer import Localizer

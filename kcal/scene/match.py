@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, possible
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.measured import Baseline
+from kcal.calibrate.rig.marks import Features
 from kcal.calibrate.rig.source import Start
-from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.sources import Baseline, RigData
 from kcal.calibrate.rig.unknowns import held
 from kcal.corners.images import Gray
 from kcal.corners.match import Keypoints, keypoints, pose_between

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import kcal.skyline.fit as fits
-from kcal.calibrate.rig.skyline import SkylineSource
+from kcal.calibrate.rig.marks import SkylineSource
 from kcal.checks import variance_factor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import ecef_from_enu_rotation, enu_to_geodetic, mean_radius
+from kcal.locate.ground import Raster
 from kcal.locate.mounting import attitude
-from kcal.locate.raster import Raster
 from kcal.skyline.horizon import (
     Border,
     Columns,

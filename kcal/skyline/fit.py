@@ -15,8 +15,7 @@ from torch import Tensor
 from kcal.calibrate.rig.unknowns import gathered, joint_unknowns
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.turning import fit_turn
+from kcal.lens.pose import fit_turn, rotation_from_vector
 from kcal.skyline.horizon import Columns, Comparison, Horizon, RasterError, SkylineErrors, compare
 
 # All headings in which a border of sky and ground could fit the horizon of a terrain, without any rough pose.

@@ -19,7 +19,7 @@ from kcal.lens.pose import step_rows
 from kcal.lens.projection import FAR, project_components
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Origin, check_refraction
 from kcal.locate.geodesy import anchor, geodetic_to_ecef, mean_radius, place_enu
-from kcal.locate.raster import Raster
+from kcal.locate.ground import Raster
 
 # The border of sky and ground in an image, column by column, between pixels and with standard deviations.
 #

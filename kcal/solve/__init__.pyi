@@ -3,5 +3,5 @@
 # Least squares
 from kcal.solve.lm import LevenbergMarquardt as LevenbergMarquardt
 from kcal.solve.lm import LMOptions as LMOptions
-from kcal.solve.problem import RobustLoss as RobustLoss
-from kcal.solve.problem import SolverStatus as SolverStatus
+from kcal.solve.lm import RobustLoss as RobustLoss
+from kcal.solve.lm import SolverStatus as SolverStatus

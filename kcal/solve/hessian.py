@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import DegenerateError
-from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.problem import S, State
+from kcal.solve.lm import LMOptions, S, State, minimize
 from kcal.solve.schur import SchurLinearization
 
 # A cost (scalar) of a shared step (S,), a local step (V, L) and data.
@@ -30,7 +29,7 @@ NO_MINIMUM = (
 
 
 class BlockProblem(Protocol[S]):
-    """What is asked of a problem: see `kcal.solve.problem.Problem`; one element, with local blocks."""
+    """What is asked of a problem: see `kcal.solve.lm.Problem`; one element, with local blocks."""
 
     @property
     def residual_count(self) -> int: ...  # noqa: D102

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.solve.problem import S, State, blend
+from kcal.solve.lm import S, State, blend
 
 # Least squares with many small local blocks that are coupled only through shared parameters.
 #

@@ -23,9 +23,8 @@ from kcal.errors import InputError
 from kcal.gaussian import triangular
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.information import CameraInformation
-from kcal.lens.model import LensModel
+from kcal.lens.model import HybridForm, LensModel
 from kcal.lens.projection import FAR
 from kcal.lens.zernike import ZernikeModes
 

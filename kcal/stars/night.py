@@ -17,10 +17,9 @@ from torch import Tensor
 import kcal.stars.sky as night_sky
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
-from kcal.lens.pose import vector_from_rotation
+from kcal.lens.pose import fit_turn, seen_turned, vector_from_rotation
 from kcal.lens.projection import FAR
 from kcal.lens.rig import Origin
-from kcal.lens.turning import fit_turn, seen_turned
 from kcal.locate.mounting import attitude
 from kcal.stars.detect import DetectedStars, detect_stars
 from kcal.stars.sky import identify, turn_between

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from kcal.calibrate.rig.marks import StarSource
 from kcal.calibrate.rig.source import Effect
-from kcal.calibrate.rig.stars import StarSource
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.projection import FAR

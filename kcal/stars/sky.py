@@ -23,8 +23,8 @@ from scipy.spatial import cKDTree
 
 from kcal.errors import FileError, InputError
 from kcal.files import make_folder, read_bytes, write_atomic
+from kcal.lens.pose import rotation_between
 from kcal.lens.rig import Origin
-from kcal.lens.turning import rotation_between
 from kcal.texts import brief
 
 # The bright stars: positions, proper motions and magnitudes, and names for the brightest.

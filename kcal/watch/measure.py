@@ -18,10 +18,9 @@ from kcal.corners.patches import fit_shifts, grid_of, has_samples, image_windows
 from kcal.errors import DegenerateError, FileError, InputError
 from kcal.files import read_bytes, write_atomic
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.lens.pose import fit_turn, rotation_from_vector, seen_turned, vector_from_rotation
 from kcal.lens.projection import FAR
 from kcal.lens.rig import Rig
-from kcal.lens.turning import fit_turn, seen_turned
 from kcal.scene.match import ImagePair, MatchedPair, match_scene
 from kcal.scene.refine import SAME, SWAY, whole_shifts
 from kcal.strict_formats import read_npz

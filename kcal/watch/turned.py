@@ -12,22 +12,20 @@ import torch
 from torch import Tensor
 
 import kcal.calibrate.rig.adjustment as adjustment
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.landmarks import Landmarks
+from kcal.calibrate.rig.marks import Features, Landmarks
 from kcal.calibrate.rig.problem import goodness_of_fit
 from kcal.calibrate.rig.result import records
 from kcal.calibrate.rig.source import Start, typical_ratio
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import SharedCovariance, relative_rows, turn_rows
+from kcal.calibrate.rig.uncertainty import SharedCovariance, relative_rows, slot_rows
 from kcal.calibrate.rig.unknowns import held
 from kcal.checks import as_points, beyond_chance, chi2_quantile, variance_factor
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.lens.pose import fit_turn, rotation_from_vector, seen_turned, vector_from_rotation
 from kcal.lens.projection import FAR
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig, RigCovariance
-from kcal.lens.turning import fit_turn, seen_turned
 from kcal.locate.budget import usual_ranges
 from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.marks import Marks
@@ -533,7 +531,7 @@ def _against(
     relative = state.rotation[1] @ state.rotation[0].T
     drift = vector_from_rotation(relative @ rig.right_from_left_rotation.T)
     own = [vector_from_rotation(now @ then.T) for now, then in zip(state.rotation, start.rotation, strict=True)]
-    alone = [known.of(turn_rows(problem, c))[0] for c in (0, 1)]
+    alone = [known.of(slot_rows(problem, problem.turn[c]))[0] for c in (0, 1)]
     compared = covariance[:3, :3]
     if before is not None:
         compared = compared + before[0]

@@ -23,9 +23,8 @@ from torch import Tensor
 import kcal.lens.inverse
 from kcal import Camera
 from kcal.lens import LensModel, bake
-from kcal.lens.distortion import distort_components
-from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.inverse import InverseStart
+from kcal.lens.model import HybridForm, distort_components
 from kcal.lens.zernike import ZernikeModes
 from kcal.nets import InverseNetOptions, train_inverse
 from scripts.bench.lens import LENS, SIZE

@@ -27,8 +27,7 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import free_parameters
 from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.projection import INTRINSICS
-from kcal.solve.lm import minimize
-from kcal.solve.problem import SolverStatus, State
+from kcal.solve.lm import SolverStatus, State, minimize
 from scripts.shared.page import write_section
 from scripts.shared.timing import show
 

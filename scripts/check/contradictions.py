@@ -3,7 +3,7 @@
     python -m scripts.check.contradictions [--draws 50] [--write]
 
 Errors are planted that neighbors share: a smooth field of the lens, a bias of matches by place, boards that bend. Each
-rig is judged without and with the widening of `kcal.calibrate.rig.disagreement`. Seeds are fixed. With --write
+rig is judged without and with the widening of `kcal.calibrate.rig.adjustment`. Seeds are fixed. With --write
 the table of docs/measured/rig.md is made.
 """
 
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from kcal import Baseline, Board, Camera, Features, Localizer, Observations, Rig, RigData, View, solve_rig
 from kcal.calibrate.rig import assess
-from kcal.calibrate.rig.disagreement import widen_for_parts
+from kcal.calibrate.rig.adjustment import widen_for_parts
 from kcal.calibrate.rig.pairs import paired_boards
 from kcal.calibrate.rig.result import RigResult
 from kcal.finding import Finding

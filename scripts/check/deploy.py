@@ -22,7 +22,7 @@ from torch import Tensor
 
 from kcal import Camera, Origin, Rig
 from kcal.lens import LensModel, save_onnx
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import Localization, Localizer
 from kcal.rig import RigCovariance

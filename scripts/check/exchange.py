@@ -25,7 +25,7 @@ from scipy.io import loadmat
 
 from kcal import Camera, Rig
 from kcal.lens import LensModel, camera_difference, export_cameras, import_cameras, rotation_from_vector
-from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
+from kcal.lens.model import HybridForm, radius_over_angle
 from kcal.lens.zernike import ZernikeModes
 from scripts.check.foreign_lenses import by_formula
 from scripts.shared.page import rows_of_others, table, tell

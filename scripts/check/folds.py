@@ -29,8 +29,8 @@ from kcal import Board, Camera, detect
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.images import expand_images
 from kcal.lens import LensModel
-from kcal.lens.distortion import distort_components
 from kcal.lens.inverse import inverse_jacobian, newton_step, prepare_inverse, undistort
+from kcal.lens.model import distort_components
 from kcal.lens.projection import from_pixels
 from kcal.lens.region import DIRECTIONS, Region, direction_limits, in_region, sampled_region, valid_region
 from scripts.check.uncertainty import LENS

@@ -26,7 +26,7 @@ import time
 from pathlib import Path
 
 from kcal import CalibrationOptions, KcalError, calibrate_camera
-from kcal.calibrate.camera.interval_check import against_capture, interval_check, simulated_capture, simulated_refits
+from kcal.calibrate.camera.trust import against_capture, interval_check, simulated_capture, simulated_refits
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.report.judge_camera import fault_of_views
 from scripts.shared.infinity import error_at_infinity

@@ -21,9 +21,8 @@ from rich.progress import track
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.distortion import distort_components
 from kcal.lens.inverse import prepare_inverse, undistort
-from kcal.lens.model import LensModel
+from kcal.lens.model import LensModel, distort_components
 from kcal.lens.region import in_region
 
 MODELS = ("opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "ext20", "ext24", "fisheye4")

@@ -18,10 +18,9 @@ from torch import Tensor
 
 from kcal import Camera, Observations, Rig, calibrate_camera, solve_rig
 from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.calibrate.rig.features import Features
-from kcal.calibrate.rig.measured import Baseline
+from kcal.calibrate.rig.marks import Features
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.sources import Baseline, RigData
 from kcal.io.camera_file import load_camera, save_camera
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.lens.pose import side_axes

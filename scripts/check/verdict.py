@@ -22,7 +22,7 @@ from torch import Tensor
 from kcal import Camera, KcalError, RigData, solve_rig
 from kcal.calibrate import examine
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.lens.turning import rotation_between
+from kcal.lens.pose import rotation_between
 from kcal.lens.uncertainty import image_sigma
 from kcal.report import camera_verdict, rig_verdict
 from kcal.report.verdict import Requirement, Verdict

@@ -26,8 +26,7 @@ from kcal.nets.inverse import (
     fit_weights,
     initial_weights,
 )
-from kcal.solve.lm import LMOptions
-from kcal.solve.problem import Result, State
+from kcal.solve.lm import LMOptions, Result, State
 from kcal.solve.schur import SchurProblem
 
 

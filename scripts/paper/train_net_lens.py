@@ -26,10 +26,8 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.hybrid.base_fit import fit_projection
-from kcal.calibrate.problem.poses import poses_under
-from kcal.calibrate.problem.views import Views
-from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.problem import State
+from kcal.calibrate.problem.views import Views, poses_under
+from kcal.solve.lm import LMOptions, State, minimize
 from scripts.paper.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
 from scripts.shared.page import write_section
 from scripts.shared.timing import median, row, show, spread

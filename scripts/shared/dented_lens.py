@@ -11,7 +11,7 @@ from torch import nn
 from kcal import Board, Camera, Observations, View
 from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.field_modes import GaussianModes
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import HybridForm
 
 BOARD = Board(columns=9, rows=7, square=0.04)
 SIZE, NOISE = (800, 600), 0.05

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from kcal.checks import as_points
-from kcal.lens.distortion import check_coefficients, distort_components
-from kcal.lens.model import LensModel
+from kcal.lens.model import LensModel, check_coefficients, distort_components
 
 
 def distort(normalized: Tensor, coefficients: Tensor, model: LensModel | str) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kcal import Camera, Origin
 from kcal.locate import enu_from_cam, enu_to_geodetic
-from kcal.locate.raster import Raster
+from kcal.locate.ground import Raster
 from kcal.rig import RasterError
 from kcal.sim.captures import drawn_lens
 from kcal.sim.raytrace import SURVEILLANCE

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcal import Baseline, Camera, Features, MeasuredPosition, RigData
-from kcal.calibrate.rig.stars import StarSource
+from kcal.calibrate.rig.marks import StarSource
 from kcal.lens.projection import FAR
 from kcal.locate import enu_from_cam
 from kcal.rig import Effect

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcal import Board, Camera, Observations, View
 from kcal.lens import LensModel
-from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
+from kcal.lens.model import HybridForm, radius_over_angle
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.captures import LensLike, PrintedBoard

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from kcal import Baseline, Camera, Features, Localizer, MeasuredPosition, RigData, calibrate_camera
+from kcal.calibrate.rig.marks import StarSource
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.stars import StarSource
 from kcal.lens.projection import FAR
 from kcal.sim.captures import TrueRig
 from kcal.stars import calibrate_by_stars, star_source

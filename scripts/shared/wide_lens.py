@@ -10,9 +10,8 @@ import numpy as np
 import torch
 
 from kcal import Board, Camera, Observations, View
-from kcal.calibrate.problem.poses import poses_under
 from kcal.calibrate.problem.state import warp_modes
-from kcal.calibrate.problem.views import Views
+from kcal.calibrate.problem.views import Views, poses_under
 from kcal.solve import LMOptions
 
 EXACT = LMOptions(max_iterations=60, tolerance=1e-12)

@@ -18,8 +18,8 @@ from matplotlib.text import Text
 
 from kcal import Board, Camera, Landmarks, Observations, Origin, RigData, RigOptions, View, solve_rig
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.interval_check import IntervalCheck
 from kcal.calibrate.camera.result import CameraCalibrationResult
+from kcal.calibrate.camera.trust import IntervalCheck
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens.difference import camera_difference, difference_text

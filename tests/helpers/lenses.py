@@ -8,9 +8,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.distortion import distort_components
-from kcal.lens.hybrid_terms import HybridForm, radius_over_angle
-from kcal.lens.model import LensModel
+from kcal.lens.model import HybridForm, LensModel, distort_components, radius_over_angle
 from kcal.lens.zernike import ASPECT, ASTIGMATIC, DECENTERED, OTHER, RADIAL, TILTED, ZernikeModes
 
 MODELS = ("opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "ext20", "ext24")

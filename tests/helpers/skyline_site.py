@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kcal import Camera, Origin
 from kcal.locate import enu_from_cam
-from kcal.locate.raster import Raster
+from kcal.locate.ground import Raster
 from kcal.rig import RasterError
 from scripts.shared.skyline_scenes import Hills, HillWeather, skyline_image
 from scripts.shared.skyline_trials import level_system, raster_around

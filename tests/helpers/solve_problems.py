@@ -13,8 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from kcal.solve.lm import DenseProblem, LMOptions, minimize
-from kcal.solve.problem import Result, State
+from kcal.solve.lm import DenseProblem, LMOptions, Result, State, minimize
 from kcal.solve.schur import SchurProblem
 
 Residual = Callable[[Tensor], Tensor]

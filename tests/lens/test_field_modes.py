@@ -19,7 +19,7 @@ from kcal import Camera, InputError
 from kcal.io.camera_file import camera_to_file, load_camera, save_camera
 from kcal.lens import LensModel
 from kcal.lens.field_modes import FieldModes, GaussianModes, NetworkModes
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import HybridForm
 from kcal.lens.pose import nearest_rotation, rotation_from_vector, step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
 from kcal.lens.zernike import ASPECT, ASTIGMATIC, DECENTERED, OTHER, RADIAL, TILTED, ZernikeModes

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.model import LensModel
+from kcal.lens.model import HybridForm, LensModel
 from kcal.lens.region import Jet, Span, direction_limits, in_region, valid_region
 from scripts.check import folds
 from scripts.check.uncertainty import LENS

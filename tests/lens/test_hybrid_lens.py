@@ -16,9 +16,8 @@ from whole_graphs import traced_whole
 
 from kcal import Camera, InputError
 from kcal.lens import LensModel, bake
-from kcal.lens.distortion import distort_components
 from kcal.lens.hybrid_points import FEWEST, PIECE, Forward, fit_plane_map, polynomials_of, trim
-from kcal.lens.hybrid_terms import HybridForm, growth_by_shape, largest_base_radius
+from kcal.lens.model import HybridForm, distort_components, growth_by_shape, largest_base_radius
 from kcal.lens.projection import plane_from_points, project_components, rays_from_plane
 from kcal.lens.views import source_pixels
 from kcal.lens.zernike import ZernikeModes

@@ -16,7 +16,7 @@ from torch.func import functional_call, stack_module_state, vmap
 from kcal import Camera, InputError, Localizer, Origin, Rig, load_camera, save_camera
 from kcal.io.rig_file import RigFile, load_rig, save_rig
 from kcal.lens import CameraRays, LensModel, Undistort, bake
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import HybridForm
 from kcal.locate import Triangulate
 from kcal.nets import NetworkModes
 

@@ -17,7 +17,7 @@ from kcal.calibrate.camera.at_setting import usable_information
 from kcal.calibrate.camera.warnings import pupil_findings
 from kcal.io.camera_file import camera_to_file, load_camera, save_camera
 from kcal.lens import LensModel
-from kcal.lens.hybrid_terms import PORT
+from kcal.lens.model import PORT
 from kcal.lens.projection import project_components
 from scripts.check.ports import seen_by
 from scripts.shared.infinity import error_at_infinity

@@ -15,7 +15,7 @@ from torch import Tensor
 from kcal import FileError, InputError, Rig
 from kcal.io.rig_file import save_rig
 from kcal.locate import Marks, check_ranges
-from kcal.locate.range_check import RangeCheck, read_known_ranges
+from kcal.locate.budget import RangeCheck, read_known_ranges
 from kcal.rig import RigCovariance
 
 RANGES = tensor(180.0, 300.0, 420.0, 560.0, 700.0, 950.0)

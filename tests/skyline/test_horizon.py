@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from kcal import InputError, Origin
 from kcal.locate import geodetic_to_enu
-from kcal.locate.raster import Raster
+from kcal.locate.ground import Raster
 from kcal.skyline.attitude import raised_horizon
 from kcal.skyline.horizon import RasterError, sky_border, terrain_horizon
 from tests.helpers.skyline_site import CELL, heights, raster_of, small_site

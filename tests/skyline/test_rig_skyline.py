@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 
 from kcal import InputError, MeasuredPosition, Origin, RigData, solve_rig
+from kcal.calibrate.rig.marks import SkylineSource
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.skyline import SkylineSource
 from kcal.calibrate.rig.source import PosedCamera
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.locate import enu_from_cam
-from kcal.locate.raster import Raster
+from kcal.locate.ground import Raster
 from kcal.locate.stations import station_mounting
 from kcal.rig import SkylineImage, skyline_source
 from kcal.skyline import attitude

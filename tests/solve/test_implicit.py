@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from kcal.errors import DegenerateError, InputError
 from kcal.solve.hessian import HessianSolve, implicit_step, newton_minimum
-from kcal.solve.lm import LevenbergMarquardt, LMOptions
-from kcal.solve.problem import State
+from kcal.solve.lm import LevenbergMarquardt, LMOptions, State
 from kcal.solve.schur import SchurLinearization, SchurProblem
 
 # Gradients through a solution.

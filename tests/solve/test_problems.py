@@ -11,8 +11,7 @@ from solve_problems import KNOWN, MISRA_X, MISRA_Y, SOLVERS, Known, beale, freud
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.solve.lm import DenseLinearization, DenseProblem, LevenbergMarquardt, LMOptions, minimize
-from kcal.solve.problem import SolverStatus
+from kcal.solve.lm import DenseLinearization, DenseProblem, LevenbergMarquardt, LMOptions, SolverStatus, minimize
 
 
 def vector(*values: float) -> Tensor:

@@ -11,8 +11,16 @@ from solve_problems import rosenbrock
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.solve.lm import DenseLinearization, DenseProblem, LevenbergMarquardt, LMOptions, minimize
-from kcal.solve.problem import RobustLoss, SolverStatus, State
+from kcal.solve.lm import (
+    DenseLinearization,
+    DenseProblem,
+    LevenbergMarquardt,
+    LMOptions,
+    RobustLoss,
+    SolverStatus,
+    State,
+    minimize,
+)
 from kcal.solve.schur import EliminatedItems, PartlyEliminated, SchurLinearization, SchurProblem, without_local
 
 # Eliminating the local blocks changes nothing but the work: Schur equals dense.

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from kcal import Camera, InputError, Origin
-from kcal.calibrate.rig.stars import StarSource, star_turns
+from kcal.calibrate.rig.marks import StarSource, star_turns
 from kcal.lens import rotation_from_vector
 from kcal.stars.detect import DetectedStars
 from kcal.stars.night import Attitude, NamedStars, SkyView

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import board_modes
-from kcal.calibrate.problem.poses import poses_under
-from kcal.calibrate.problem.views import Views
+from kcal.calibrate.problem.views import Views, poses_under
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError
@@ -426,8 +425,12 @@ def next_view(camera: Camera, board: Board, noise: float, taken: Tensor | None =
     half, shapes = known.half(), board_modes(board.points).shapes
     if taken is not None and len(taken):
         half = _half_after(camera, known, board.points, shapes, half, taken, noise)
-    slopes = _image_slopes(camera, known) @ half.T
-    gains = []
+    # Derivatives of the image's grid by the unknowns, far away, after the best-fit rotation.
+    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
+    by_camera, by_motion, good = pixel_slopes(camera, camera.grid(*_GRID).reshape(-1, 2), math.inf, wanted)
+    flat, by_turn = by_camera[good].flatten(0, 1), by_motion[good][..., :3].flatten(0, 1)
+    flat = flat - by_turn @ torch.linalg.lstsq(by_turn, flat).solution
+    slopes, gains = flat @ known.selection()[wanted] @ half.T, []
     for rotation, translation in zip(views.rotation, views.translation, strict=True):
         rows = _view_rows(camera, known, board.points, shapes, rotation, translation) @ half.T / noise
         # Variance that this view takes away: G Aᵀ (1 + A Aᵀ)⁻¹ A Gᵀ.
@@ -454,14 +457,6 @@ def _half_after(
 
 def _kept(items: Sequence[T], good: Tensor) -> list[T]:
     return [item for item, fits in zip(items, good.tolist(), strict=True) if fits]
-
-
-def _image_slopes(camera: Camera, known: CameraInformation) -> Tensor:
-    """(2 G, U) derivatives of the image's grid by the unknowns, far away, after the best-fit rotation."""
-    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
-    by_camera, by_motion, good = pixel_slopes(camera, camera.grid(*_GRID).reshape(-1, 2), math.inf, wanted)
-    flat, by_turn = by_camera[good].flatten(0, 1), by_motion[good][..., :3].flatten(0, 1)
-    return (flat - by_turn @ torch.linalg.lstsq(by_turn, flat).solution) @ known.selection()[wanted]
 
 
 def _view_rows(

@@ -14,18 +14,15 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.result import HYBRID, NETWORK, CalibrationOptions, Progress
-from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.hybrid.fitted_views import moving_residuals
-from kcal.calibrate.problem.poses import poses_under
-from kcal.calibrate.problem.views import Views, whitening
+from kcal.calibrate.problem.views import Views, poses_under, whitening
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
 from kcal.gaussian import triangular
 from kcal.lens.calibration import CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid_terms import radius_over_angle
 from kcal.lens.information import CameraInformation
-from kcal.lens.model import LensModel
+from kcal.lens.model import LensModel, radius_over_angle
 from kcal.lens.projection import FAR, project_components
 from kcal.lens.uncertainty import FIT_PX, fitted_errors, inverse_half, pixel_covariance
 from kcal.solve.lm import LMOptions
@@ -413,7 +410,11 @@ def camera_at_setting(
 
     calibrations = []
     alone, boards = zip(*map(_errors, known), strict=True)
-    for halves, together in ((alone, False), (boards, _one_board(cameras, boards))):
+    records = [camera.calibration.record if camera.calibration else None for camera in cameras]
+    kinds = {None if record is None else record.board for record in records}
+    # Whether all cameras may have seen the same board.
+    one_board = len(kinds) == 1 and len(set(map(len, boards))) == 1
+    for halves, together in ((alone, False), (boards, one_board)):
         parts = [
             weight * one.changes(half[:, own])
             for weight, one, half, own in zip(weights, seen, halves, free, strict=True)
@@ -448,13 +449,6 @@ def _errors(known: CameraInformation) -> tuple[Tensor, Tensor]:
     half = torch.where(half.diagonal() < 0, -1.0, 1.0)[:, None] * half
     by_parameter = half[:, board:] @ known.selection()[:, :count].T
     return by_parameter[board:], by_parameter[:board]
-
-
-def _one_board(cameras: Sequence[Camera], errors: Sequence[Tensor]) -> bool:
-    """Whether all cameras may have seen the same board."""
-    records = [camera.calibration.record if camera.calibration else None for camera in cameras]
-    boards = {None if record is None else record.board for record in records}
-    return len(boards) == 1 and len({len(one) for one in errors}) == 1
 
 
 def _far_sigma(camera: Camera, half: Tensor) -> float:
@@ -608,7 +602,11 @@ def compare_models(
     members = _groups(observations, groups, parts)
     weights = torch.eye(2, dtype=torch.float64).expand(*observations.pixels().shape[:2], 2, 2)
     weighted = False
-    judge = _motion(observations, options)
+    try:
+        # A fit of all views, which tells how much they move: the same for all models.
+        judge = calibrate_camera(observations, _options(HYBRID, options)).hybrid
+    except KcalError:
+        judge = None
     costs = torch.full((len(names), len(members)), torch.inf, dtype=torch.float64)
     failures: dict[str, KcalError] = {}
     # Groups are dealt at random, so that no part is one end of the capture.
@@ -648,15 +646,6 @@ def compare_models(
         corners=torch.stack([seen[group].sum() for group in members]),
         failures={name: str(error) for name, error in failures.items()},
     )
-
-
-def _motion(observations: Observations, options: CalibrationOptions) -> HybridFit | None:
-    """A fit of all views, which tells how much they move: the same for all models; None: they stand still."""
-    try:
-        fit = calibrate_camera(observations, _options(HYBRID, options)).hybrid
-    except KcalError:
-        return None
-    return fit if fit is not None and fit.readout is not None else None
 
 
 def _options(model: str | LensModel, options: CalibrationOptions) -> CalibrationOptions:

@@ -30,7 +30,6 @@ from kcal.calibrate.camera.warnings import spacing_findings, unit_findings
 from kcal.calibrate.hybrid.base_fit import may_be_unequal
 from kcal.calibrate.hybrid.board_modes import turned_corners
 from kcal.calibrate.hybrid.cameras_fit import LEAST_CAMERAS, Run, fit_cameras
-from kcal.calibrate.hybrid.fit import HybridFit
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError
@@ -79,7 +78,7 @@ def sharing(
     if not options.hybrid or not (together or (one_type and len(known) >= LEAST_CAMERAS)):
         return found
     used = {i: result.per_view_rms.isfinite().nonzero()[:, 0].tolist() for i, result in known.items()}
-    alone = [_hybrid_of(result).only(used[i]) for i, result in known.items()]
+    alone = [result.hybrid.only(used[i]) for i, result in known.items() if result.hybrid is not None]
     fitted = fit_cameras(
         [result.observations.subset([result.observations.names[k] for k in used[i]]) for i, result in known.items()],
         names=[str(i + 1) for i in known],
@@ -101,20 +100,14 @@ def sharing(
         pixels = before.observations.pixels()
         copied = {k: of for k, of in copied_views(pixels, before.noise).items() if k not in used[i]}
         repeats = (*copy_findings(before.observations.names, copied), *pose_findings(pixels[used[i]]))
-        repeats = (*repeats, *unit_findings(after))
         found[i] = dataclasses.replace(
             after,
-            findings=(*lasting_findings(before), *after.findings, *repeats),
+            findings=(*lasting_findings(before), *after.findings, *repeats, *unit_findings(after)),
             rejected_corners=before.rejected_corners,
             rejected_views=before.rejected_views,
             shared_board=shared,
         )
     return found
-
-
-def _hybrid_of(result: CameraCalibrationResult) -> HybridFit:
-    assert result.hybrid is not None
-    return result.hybrid
 
 
 def _in_order(seen: Observations, used: Sequence[int], turns: Tensor) -> Observations:
@@ -134,13 +127,9 @@ def _in_order(seen: Observations, used: Sequence[int], turns: Tensor) -> Observa
 __all__ = ["CalibrationOptions", "CameraCalibrationResult", "calibrate_camera", "calibrate_cameras"]
 
 
-def _silent(_: str) -> None:
-    return None
-
-
 @in_one_thread
 def calibrate_camera(
-    observations: Observations, options: CalibrationOptions | None = None, progress: Progress = _silent
+    observations: Observations, options: CalibrationOptions | None = None, progress: Progress = lambda _: None
 ) -> CameraCalibrationResult:
     """Find a camera's intrinsics and lens from views of a board.
 
@@ -243,8 +232,8 @@ def _complete(
 ) -> CameraCalibrationResult:
     """A result without copies as one for all observations, with doubts about views that add nothing."""
     pixels, names = observations.pixels(), observations.names
-    findings = (*result.findings, *copy_findings(names, copied), *pose_findings(result.observations.pixels()))
-    findings = (*findings, *unit_findings(result))
+    more = (*copy_findings(names, copied), *pose_findings(result.observations.pixels()), *unit_findings(result))
+    findings = (*result.findings, *more)
     kept = [i for i in range(len(names)) if i not in copied]
     left_out = tuple(
         Rejected(
@@ -270,7 +259,7 @@ def _calibrate(observations: Observations, options: CalibrationOptions, progress
 def calibrate_cameras(
     observations: Sequence[Observations],
     options: CalibrationOptions | None = None,
-    progress: Progress = _silent,
+    progress: Progress = lambda _: None,
     *,
     one_type: bool = False,
 ) -> list[CameraCalibrationResult | KcalError]:

@@ -16,8 +16,7 @@ from kcal.calibrate.camera.result import (
     Progress,
     Rejected,
 )
-from kcal.calibrate.problem.poses import homographies, spread_out
-from kcal.calibrate.problem.views import LEAST_NOISE
+from kcal.calibrate.problem.views import LEAST_NOISE, homographies, spread_out
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding

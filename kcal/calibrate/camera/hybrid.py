@@ -1,7 +1,7 @@
 """Calibrate one camera without a lens model to choose: the default of `calibrate_camera`.
 
 The lens is a base projection between pinhole and fisheye, corrected by a smooth field and by an entrance pupil that
-moves with the angle (`kcal.lens.hybrid_terms`); the board may be bent and misprinted
+moves with the angle (`kcal.lens.model`); the board may be bent and misprinted
 (`kcal.calibrate.hybrid.board_modes`). How large each of these may be is told by the evidence of the views themselves
 (`kcal.calibrate.hybrid.evidence`), so a few views give a plain lens with wide error bars, and many views a detailed
 one.
@@ -55,7 +55,7 @@ from kcal.calibrate.hybrid.fit import FitOptions, FitStart, HybridFit, fit_hybri
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding
-from kcal.solve.problem import SolverStatus
+from kcal.solve.lm import SolverStatus
 
 # The unknowns that the views alone must determine: focal length, principal point, shape of the base projection.
 _UNKNOWNS = 4
@@ -286,10 +286,12 @@ def _with_start(result: CameraCalibrationResult, given: float | None) -> CameraC
     found = float(result.camera.focal[0])
     if given is None or 1.0 / _FAR < found / given < _FAR:
         return result
-    text = (
-        f"the focal length that was given for the start ({given:.4g} px) is far from the camera's ({found:.4g} px): it "
-        "was not used"
-    )
+    return _without_given(result, given, f"is far from the camera's ({found:.4g} px)")
+
+
+def _without_given(result: CameraCalibrationResult, given: float, why: str) -> CameraCalibrationResult:
+    """A result, with the doubt of a focal length that was given."""
+    text = f"the focal length that was given for the start ({given:.4g} px) {why}: it was not used"
     note = Finding("start", "doubt", text, "leave it out, or correct it")
     return dataclasses.replace(result, findings=(note, *result.findings))
 
@@ -305,12 +307,7 @@ def _without_start(
         )
     except InputError:
         raise failure from None
-    text = (
-        f"no lens with the focal length that was given for the start ({given:.4g} px) shows the corners: it was not "
-        "used"
-    )
-    note = Finding("start", "doubt", text, "leave it out, or correct it")
-    return dataclasses.replace(result, findings=(note, *result.findings))
+    return _without_given(result, given, "belongs to no lens that shows the corners")
 
 
 def _wrong_views(observations: Observations, options: CalibrationOptions) -> dict[int, str]:

@@ -25,8 +25,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.projection import parameter_names, project_components
 from kcal.solve.hessian import HessianSolve, implicit_step, newton_minimum
-from kcal.solve.lm import LMOptions
-from kcal.solve.problem import map_state
+from kcal.solve.lm import LMOptions, map_state
 from kcal.texts import brief
 from kcal.threads import in_one_thread
 

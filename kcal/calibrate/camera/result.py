@@ -28,8 +28,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes, NetworkModes
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
-from kcal.solve.lm import LMOptions
-from kcal.solve.problem import RobustLoss, SolverStatus
+from kcal.solve.lm import LMOptions, RobustLoss, SolverStatus
 from kcal.texts import brief
 
 # Options of a camera's calibration.
@@ -366,6 +365,7 @@ class CameraCalibrationResult(ArrowRows):
         board, warp = self.observations.board, self.board_warp
         per_view = zip(self.observations.names, self.per_view_rms.tolist(), strict=True)
         used = {view: rms for view, rms in per_view if not math.isnan(rms)}
+        moved = None if self.hybrid is None and warp is None else (self.board_points - board.points).tolist()
         return CalibrationRecord(
             rms=self.rms,
             views=len(used),
@@ -378,7 +378,7 @@ class CameraCalibrationResult(ArrowRows):
             iterations=self.iterations,
             noise=self.noise,
             tempering=None if self.hybrid is None else self.hybrid.tempering,
-            board_deviation=self._board_deviation(),
+            board_deviation=None if moved is None else tuple((x, y, z) for x, y, z in moved),
             warnings=self.warnings,
             **provenance(),
         )
@@ -387,13 +387,6 @@ class CameraCalibrationResult(ArrowRows):
     def warnings(self) -> tuple[str, ...]:
         """The findings as sentences."""
         return sentences(self.findings)
-
-    def _board_deviation(self) -> tuple[tuple[float, float, float], ...] | None:
-        """As `CalibrationRecord.board_deviation`."""
-        if self.hybrid is None and self.board_warp is None:
-            return None
-        moved = self.board_points - self.observations.board.points
-        return tuple((x, y, z) for x, y, z in moved.tolist())
 
     def to_arrow(self) -> Any:
         """The table of the observations (`kcal.Observations.to_arrow`), and `residual_u`, `residual_v`; null: left out.

@@ -31,26 +31,25 @@ from kcal.calibrate.camera.warnings import (
 from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import CoefficientPrior, FoldBarrier, GaussianPrior, Term, is_overparameterized
-from kcal.calibrate.problem.poses import poses_under, unflip
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import (
     LEAST_NOISE,
     CameraViews,
     information_of,
     noise_variance,
+    poses_under,
     uncertainty_of,
+    unflip,
     whitening,
 )
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.gaussian import Covariance
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid_terms import radius_over_angle
 from kcal.lens.information import CameraInformation
-from kcal.lens.model import LensModel
+from kcal.lens.model import LensModel, radius_over_angle
 from kcal.lens.projection import INTRINSICS
-from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.problem import Result, RobustLoss, SolverStatus
+from kcal.solve.lm import LMOptions, Result, RobustLoss, SolverStatus, minimize
 
 # Where a parametric camera begins: at the base projection of the hybrid lens, whose curve its own terms follow.
 
@@ -129,7 +128,7 @@ def follow_base(shape: float, widest: float, model: LensModel, fixed: Mapping[st
     1963). Coefficients that the curve leaves open stay as small as a prior has them.
 
     Args:
-        shape: of the base projection (`kcal.lens.hybrid_terms`).
+        shape: of the base projection (`kcal.lens.model`).
         widest: angle off the axis, radians, up to which it is followed.
         model: the lens model.
         fixed: coefficients that are held, by name.
@@ -160,17 +159,11 @@ def follow_base(shape: float, widest: float, model: LensModel, fixed: Mapping[st
     denominator = torch.ones_like(s)
     for _ in range(10 if bottom else 1):
         weight = radius / denominator
-        target = ratio - 1.0 - columns @ torch.where(_is_in(free, columns), 0.0, out[[*top, *bottom]])
+        target = ratio - 1.0 - columns @ out[[*top, *bottom]].index_fill(0, torch.tensor(free), 0.0)
         rows = torch.cat([columns[:, free] * weight[:, None], ridge])
         right = torch.cat([target * weight, torch.zeros(len(free), dtype=torch.float64)])
         out[chosen] = torch.linalg.lstsq(rows, right[:, None]).solution[:, 0]
         denominator = 1.0 + sum((s ** (j + 1) * out[i] for j, i in enumerate(bottom)), start=torch.zeros_like(s))
-    return out
-
-
-def _is_in(chosen: Sequence[int], columns: Tensor) -> Tensor:
-    out = torch.zeros(columns.shape[1], dtype=torch.bool)
-    out[list(chosen)] = True
     return out
 
 
@@ -301,7 +294,11 @@ def solve_corners(
         spent += steps
     progress(str(model))
     plain, problem = views.lens_problem(model), views.lens_problem(model, terms)
-    result = _beside_barrier(plain, result)
+    # Its cost without the barrier; `AT_BOUND` where the barrier matters.
+    cost, status = plain.cost(result.state), result.status
+    if result.converged and float(result.cost - cost) > _AT_BARRIER * float(cost) / plain.residual_count:
+        status = torch.full_like(status, int(SolverStatus.AT_BOUND))
+    result = dataclasses.replace(result, cost=cost, status=status)
     others = [one.led for one in found] + [one.result.state for one in found if one is not best]
     covariances = covariances if options.weighted else None
     solution = Solution(
@@ -365,14 +362,6 @@ def _solve_from(
             result = minimize(known.lens_problem(model, start.terms), state, solver)
             spent += int(result.iterations)
     return _Found(known, result, start.terms, led, spent)
-
-
-def _beside_barrier(plain: BoardProblem, result: Result[BoardState]) -> Result[BoardState]:
-    """A result with its cost without the barrier; its status is `AT_BOUND` where the barrier matters."""
-    cost, status = plain.cost(result.state), result.status
-    if result.converged and float(result.cost - cost) > _AT_BARRIER * float(cost) / plain.residual_count:
-        status = torch.full_like(status, int(SolverStatus.AT_BOUND))
-    return dataclasses.replace(result, cost=cost, status=status)
 
 
 def _with_prior(views: CameraViews, prior: CoefficientPrior) -> CameraViews:
@@ -486,9 +475,7 @@ def _uncertainty(
     count, residuals = plain.shared_size + 6 * len(state.translation), plain.residual_count + plain.prior_count
     found = uncertainty_of(linear, residuals, count)
     variance = float(noise_variance(linear, residuals, count))
-    if not found.computed or not variance > 0:
-        return found, None
-    if not len(plain.free):
+    if not found.computed or not variance > 0 or not len(plain.free):
         return found, None
     return found, information_of(plain, state, math.sqrt(variance)).without_board()
 

@@ -19,7 +19,7 @@ from kcal.finding import Finding
 from kcal.lens.camera import Camera
 from kcal.lens.projection import pupil_depth
 from kcal.lens.uncertainty import paraxial_focal
-from kcal.solve.problem import SolverStatus
+from kcal.solve.lm import SolverStatus
 from kcal.texts import percent_text
 
 # Warnings about how views were taken: motion while rows were read, and images that were stretched.

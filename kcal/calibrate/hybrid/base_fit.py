@@ -13,13 +13,11 @@ from kcal.calibrate.hybrid.board_modes import KNOWN, STRETCH, BoardModes, board_
 from kcal.calibrate.hybrid.evidence import Amplitudes
 from kcal.calibrate.hybrid.families import BOARD, LensPrior, PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fitted_views import Estimate, FittedViews, hybrid_unknowns
-from kcal.calibrate.problem.poses import homographies, poses_from_homographies
 from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.problem.views import LEAST_NOISE
+from kcal.calibrate.problem.views import LEAST_NOISE, homographies, poses_from_homographies
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.field_modes import FieldModes
-from kcal.lens.hybrid_terms import HybridForm, angle_over_radius, radius_over_angle
-from kcal.lens.model import LensModel
+from kcal.lens.model import HybridForm, LensModel, angle_over_radius, radius_over_angle
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions, minimize
 

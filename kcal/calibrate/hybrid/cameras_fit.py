@@ -27,8 +27,8 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.gaussian import Gaussian, numbered, stacked
-from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.information import BOARD_SLOT, LENS_SLOT
+from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 from kcal.threads import in_one_thread
 

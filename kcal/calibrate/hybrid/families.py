@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import KNOWN, BoardModes
 from kcal.lens.field_modes import FieldModes
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 
 # After the hyperparameters of the modes: ln amplitudes of the pupil (in units of the board's range) and of the board:

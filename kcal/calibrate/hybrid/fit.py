@@ -44,9 +44,8 @@ from kcal.errors import InputError
 from kcal.gaussian import triangular
 from kcal.lens.camera import Camera
 from kcal.lens.field_modes import FieldModes
-from kcal.lens.hybrid_terms import LEADING, PORT, angle_over_radius
 from kcal.lens.information import CameraInformation
-from kcal.lens.model import LensModel
+from kcal.lens.model import LEADING, PORT, LensModel, angle_over_radius
 from kcal.lens.projection import INTRINSICS, pupil_depth
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.schur import products_of

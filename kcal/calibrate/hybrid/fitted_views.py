@@ -45,8 +45,7 @@ from kcal.gaussian import Gaussian, numbered
 from kcal.lens.camera import Camera
 from kcal.lens.information import LENS_SLOT
 from kcal.lens.model import LensModel
-from kcal.solve.lm import LMOptions, minimize
-from kcal.solve.problem import RobustLoss
+from kcal.solve.lm import LMOptions, RobustLoss, minimize
 
 # What is unknown of a hybrid camera and of the board that it saw, and the least squares of both under their priors.
 

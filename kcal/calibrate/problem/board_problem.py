@@ -14,11 +14,10 @@ from torch import Tensor
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior, Term
 from kcal.calibrate.problem.state import BoardState, Readout, warp_modes
 from kcal.gaussian import triangular
-from kcal.lens.hybrid_terms import LEADING, fill_field_columns
-from kcal.lens.model import LensModel
+from kcal.lens.model import LEADING, LensModel, fill_field_columns
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, Projection, project_components
-from kcal.solve.problem import RobustLoss, State
+from kcal.solve.lm import RobustLoss, State
 from kcal.solve.schur import Products, SchurLinearization, SchurProblem, without_local
 
 # How a pose takes a step: along a twist, so that long steps of many boards stay close to the linear model.

@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 
 import kcal.calibrate.rig.explanations as explanations
-from kcal.calibrate.rig.adjustment import Adjustment
-from kcal.calibrate.rig.disagreement import widen_for_parts
-from kcal.calibrate.rig.features import FeatureBlock
+from kcal.calibrate.rig.adjustment import Adjustment, widen_for_parts
 from kcal.calibrate.rig.initial_poses import InitialPoses
+from kcal.calibrate.rig.marks import FeatureBlock
 from kcal.calibrate.rig.motion import moved_findings, scatter_findings
 from kcal.calibrate.rig.problem import RigProblem, goodness_of_fit
 from kcal.calibrate.rig.resection import distinct_poses
@@ -33,8 +32,7 @@ from kcal.io.camera_file import provenance
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
-from kcal.solve.lm import LMOptions
-from kcal.solve.problem import Result, SolverStatus
+from kcal.solve.lm import LMOptions, Result, SolverStatus
 from kcal.texts import counted_text, length_text
 
 # Refuse rigs whose baseline is so open that intervals of ranges are wrong; widen intervals where that helps.
@@ -264,7 +262,9 @@ def open_place(
     found = found - by_place - (targets.at(true.expand_as(found)) @ steps[:, :, None])[..., 0]
     variance = targets.own + targets.at(found).square().sum(-1)
     errors = (found - true).square() / variance
-    common = _common(problem, second, seen @ rotation.T)
+    # What the second camera sees, too.
+    pixels, valid = problem.cameras[second].project(seen @ rotation.T)
+    common = valid & problem.cameras[second].inside(pixels)
     mean = torch.where(common, errors.nan_to_num(math.inf), 0.0).sum(-1) / common.sum(-1).clamp_min(1)
     return OpenPlace(float(share.median()), math.sqrt(float(mean.max())) / _SIGMAS, axes[:, 0], float(sigmas[0]))
 
@@ -285,13 +285,6 @@ def _first_order(rays: Tensor, true: Tensor, center: Tensor, moved: Tensor) -> T
     square = center @ center - p * p
     found = (rays @ center - p * q) / square
     return (2.0 * found * p * dp - dp * q - p * dq) / square
-
-
-def _common(problem: RigProblem, second: int, points: Tensor) -> Tensor:
-    """Which points (..., 3) in the second camera's frame it sees."""
-    camera = problem.cameras[second]
-    pixels, valid = camera.project(points)
-    return valid & camera.inside(pixels)
 
 
 def _targets(
@@ -520,10 +513,10 @@ def rig_result(
     more = check_poses(problem, state, covariance, data.names, refuse=refuse)
     doubts += [] if doubts else more
     refuse_several(work, mask)
-    against = explanations.contradictions(work, problem, state)
-    certain = [one for one in against if one.sigmas > explanations.CERTAIN]
-    if refuse and certain and certain[0].stated:
-        raise InputError(certain[0].text)
+    against = explanations.contradiction(work, problem, state)
+    certain = against is not None and against.sigmas > explanations.CERTAIN
+    if against is not None and certain and refuse and against.stated:
+        raise InputError(against.text)
     told = records(work, mask, reasons)
     rms = math.sqrt(float(told.squared.sum() / told.counts.sum()))
     status = SolverStatus(int(found.status))
@@ -539,7 +532,8 @@ def rig_result(
         times = math.sqrt(fit.variance)
         doubt("sigmas", f"residuals are {times:.1f} times as large as their sigmas say; the covariance was widened")
     findings += apart
-    findings += [Finding("contradiction", "stop" if one in certain else "doubt", one.text) for one in against]
+    if against is not None:
+        findings.append(Finding("contradiction", "stop" if certain else "doubt", against.text))
     only_boards = len(problem.blocks) == 1 and problem.blocks[0].many
     if only_boards and (count := int(mask.sum())) < _FEW_BOARDS:
         doubt("pairs", f"{counted_text(count, 'pair')} only: a wrong one could not be noticed", "5 or more are good")

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import LOSS, MOST_WRONG, ROUGHLY, Adjustment, without_wrong
-from kcal.calibrate.rig.features import FeatureBlock
+from kcal.calibrate.rig.marks import FeatureBlock
 from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, goodness_of_fit, least
 from kcal.calibrate.rig.resection import consensus_pose
 from kcal.calibrate.rig.source import RigState
@@ -256,8 +256,8 @@ class _Test(NamedTuple):
     sigmas: float
 
 
-def contradictions(work: Adjustment, problem: RigProblem, state: RigState) -> list[Contradiction]:
-    """The source that contradicts the others, or both of two that contradict each other; empty where all agree."""
+def contradiction(work: Adjustment, problem: RigProblem, state: RigState) -> Contradiction | None:
+    """The source that contradicts the others, or both of two that contradict each other; None where all agree."""
     prior = problem.prior_rows(state)
     known = _Part("", prior @ prior.T, prior.shape[1], None)
     parts = _parts(work, problem, state)
@@ -265,14 +265,17 @@ def contradictions(work: Adjustment, problem: RigProblem, state: RigState) -> li
     placed = tuple(i for i, part in enumerate(parts) if part.name.startswith("the position"))
     if len(placed) > 1:
         groups.append(placed)
-    if len(parts) < 2:
-        return []
     everything = tuple(range(len(parts)))
     tests = {group: _test(parts, group, everything, known) for group in groups if len(group) < len(parts)}
     found = {group: test for group, test in tests.items() if test.sigmas > _DOUBT}
     if not found:
-        return []
-    suspects = [group for group in found if not _quarrel(parts, set(everything) - set(group), known)]
+        return None
+
+    def quarrel(within: tuple[int, ...]) -> bool:
+        """Whether some parts contradict each other."""
+        return len(within) > 1 and any(_test(parts, (i,), within, known).sigmas > _DOUBT for i in within)
+
+    suspects = [group for group in found if not quarrel(tuple(i for i in everything if i not in group))]
     own = {group: sum(parts[i].rows for i in group) - least(_sum(parts, group)).rank for group in found}
     suspects = suspects or [max(found, key=lambda group: found[group].sigmas)]
     suspects.sort(key=lambda group: (own[group], len(group), -found[group].sigmas))
@@ -284,13 +287,7 @@ def contradictions(work: Adjustment, problem: RigProblem, state: RigState) -> li
     if equal:
         names = " and ".join(_name(parts, group) for group in equal)
         text += f"; it may as well be {names} that is wrong"
-    return [Contradiction(text, found[named].sigmas, own[named] <= 0)]
-
-
-def still_determined(problem: RigProblem, state: RigState) -> list[bool]:
-    """For each of the problem's terms whether the others determine as much without it."""
-    whole = torch.stack([*problem.block_grams(state), *_term_grams(problem, state)]).sum(0)
-    return [least(whole - gram).rank == least(whole).rank for gram in _term_grams(problem, state)]
+    return Contradiction(text, found[named].sigmas, own[named] <= 0)
 
 
 def _term_grams(problem: RigProblem, state: RigState) -> list[Tensor]:
@@ -332,12 +329,6 @@ def _test(parts: list[_Part], group: tuple[int, ...], within: tuple[int, ...], k
     # Wilson and Hilferty (1931).
     spread = 2.0 / (9.0 * freedom)
     return _Test(chi2, freedom, ((chi2 / freedom) ** (1 / 3) - 1.0 + spread) / math.sqrt(spread))
-
-
-def _quarrel(parts: list[_Part], within: set[int], known: _Part) -> bool:
-    """Whether some parts contradict each other."""
-    some = tuple(sorted(within))
-    return len(some) > 1 and any(_test(parts, (i,), some, known).sigmas > _DOUBT for i in some)
 
 
 def _name(parts: list[_Part], group: tuple[int, ...]) -> str:
@@ -423,13 +414,13 @@ def explained(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
         kept = without_wrong(work, mask, solver)
     except InputError as error:
         failure = error
-    few = decided_by_few(work, mask)
+    few = int(mask[work.at("landmarks")].sum()) <= _FEW and decided_by_landmarks(work, mask)
     gone = int((mask & ~kept).sum())
     if not few and (failure is not None or gone):
         _refuse_terms(work, mask, None if failure is not None else kept, robust, solver)
     if failure is not None and not few:
         raise failure
-    if not few or (failure is None and not gone and _agree(work, mask)):
+    if not few or (not failure and not gone and goodness_of_fit(work.problem(mask), work.part(mask)).variance == 1.0):
         return kept
     marks = int(mask[work.at("landmarks")].sum())
     # Nothing stands out, yet χ² is too large: a wrong item may have bent the solution towards itself.
@@ -440,10 +431,12 @@ def explained(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
             raise failure
         if not gone:
             return kept
+        wrong, at = work.none(), work.at("landmarks")
+        wrong[at] = (mask & ~kept)[at]
         raise InputError(
             "the landmarks contradict each other, and whichever are left out, the rest does not agree, or too few are "
-            f"left to check it with ({marks} landmarks; worst: {_worst_names(work, mask, kept)}): check names, "
-            "coordinates and marks, and add landmarks"
+            f"left to check it with ({marks} landmarks; worst: {', '.join(_gone(work, wrong)) or 'all of them'}): "
+            "check names, coordinates and marks, and add landmarks"
         )
     if len(found) > 1:
         raise _several_ways([f"{' and '.join(one.names)} (χ² {one.fit.chi2:.3g})" for one in found[:3]])
@@ -454,11 +447,6 @@ def explained(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
     work.solve(best.mask, solver)
     work.fit_corners(best.mask)
     return best.mask
-
-
-def _agree(work: Adjustment, mask: Tensor) -> bool:
-    """Whether χ² is no larger than chance explains."""
-    return goodness_of_fit(work.problem(mask), work.part(mask)).variance == 1.0
 
 
 def _excess(found: _Explanation) -> float:
@@ -496,8 +484,12 @@ def _refuse_terms(work: Adjustment, mask: Tensor, kept: Tensor | None, robust: R
         names = tuple(_gone(work, mask & ~kept))
         ways.append(_Explanation.of(work, kept, names, len(names)))
     some = mask if kept is None else kept
-    for term, determined in enumerate(still_determined(work.problem(some), work.part(some))):
-        if not determined:
+    problem, state = work.problem(some), work.part(some)
+    grams = _term_grams(problem, state)
+    whole = torch.stack([*problem.block_grams(state), *grams]).sum(0)
+    for term, gram in enumerate(grams):
+        # The others must determine as much without it.
+        if least(whole - gram).rank != least(whole).rank:
             continue
         trial = copy.copy(work)
         trial.state, trial.without = robust, frozenset([term])
@@ -524,17 +516,6 @@ def _refuse_terms(work: Adjustment, mask: Tensor, kept: Tensor | None, robust: R
 def _gone(work: Adjustment, mask: Tensor) -> list[str]:
     """What the items in the mask are called."""
     return [work.labels[i] for i in mask.nonzero()[:, 0].tolist()]
-
-
-def _worst_names(work: Adjustment, mask: Tensor, kept: Tensor) -> str:
-    wrong, at = work.none(), work.at("landmarks")
-    wrong[at] = (mask & ~kept)[at]
-    return ", ".join(_gone(work, wrong)) or "all of them"
-
-
-def decided_by_few(work: Adjustment, mask: Tensor) -> bool:
-    """Whether a camera depends on landmarks, and these are few."""
-    return int(mask[work.at("landmarks")].sum()) <= _FEW and decided_by_landmarks(work, mask)
 
 
 def decided_by_landmarks(work: Adjustment, mask: Tensor) -> bool:

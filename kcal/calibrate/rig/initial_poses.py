@@ -9,14 +9,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.boards import Boards
 from kcal.calibrate.rig.pairs import SeenAlone, check_cameras, half_turn, pose_alone, refuse_wrong_pairs
 from kcal.calibrate.rig.resection import consensus_rotation, distinct_poses
 from kcal.calibrate.rig.source import Start, as_items
-from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.sources import Boards, RigData
 from kcal.errors import DegenerateError
-from kcal.lens.pose import Pose
-from kcal.lens.turning import rotation_between
+from kcal.lens.pose import Pose, rotation_between
 from kcal.solve.lm import LMOptions
 
 # Find roughly where the cameras and boards of a rig stand, before everything is adjusted together.
@@ -37,23 +35,6 @@ class TurnedBoard(NamedTuple):
     camera: str
 
 
-@dataclasses.dataclass(kw_only=True, eq=False)
-class InitialPoses:
-    """What a solve begins with.
-
-    Args:
-        data: with boards turned where they had been read from the other end.
-        starts: possible starts; the one with the best solution is used.
-        flipped: boards that were turned.
-        foreign: indices of boards that do not belong, with the reason.
-    """
-
-    data: RigData
-    starts: list[Start]
-    flipped: list[TurnedBoard]
-    foreign: dict[int, str]
-
-
 # The cameras whose poses (cam_from_world) were found so far.
 _Known = dict[int, Pose]
 
@@ -68,7 +49,7 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
     # Where several sources tell a pose, the first of them counts.
     for source in reversed(data.sources):
         known |= source.poses(data.cameras, places)
-    views = _BoardViews(data, solver)
+    views = InitialPoses(data, solver)
     placed = bool(known)
     starts = None if placed else _level_starts(data)
     if starts is None:
@@ -88,8 +69,8 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
         if data.absolute and not placed:
             starts = [_into_frame(data, start) for start in starts]
     views.turn_all()
-    starts = [start._replace(boards=as_items(*views.world(start))) for start in starts]
-    return InitialPoses(data=views.data, starts=starts, flipped=views.flipped, foreign=views.foreign)
+    views.starts = [start._replace(boards=as_items(*views.world(start))) for start in starts]
+    return views
 
 
 def _stacked(known: _Known) -> tuple[Tensor, Tensor]:
@@ -208,11 +189,19 @@ def _into_frame(data: RigData, start: Start) -> Start:
     return Start(start.rotation @ turn.T, (start.center - here.mean(0)) @ turn.T + there.mean(0))
 
 
-class _BoardViews:
-    """Board poses from each camera alone, and the relative poses of cameras that saw the same boards."""
+class InitialPoses:
+    """What a solve begins with: board poses from each camera alone, and those of cameras that saw the same boards.
+
+    Attributes:
+        data: with boards turned where they had been read from the other end.
+        starts: possible starts; the one with the best solution is used.
+        flipped: boards that were turned.
+        foreign: indices of boards that do not belong, with the reason.
+    """
 
     def __init__(self, data: RigData, solver: LMOptions) -> None:
         self.data = data
+        self.starts: list[Start] = []
         self.flipped: list[TurnedBoard] = []
         self.foreign: dict[int, str] = {}
         self._alone: list[Pose] = []

@@ -195,10 +195,12 @@ class RigRows:
         """
         whole, (_, shared, rows) = self._all(), self.parts[camera]
         moving, rows = white[self.good], rows[self.good]
-        by_pose = whole.off_pose(moving @ rows[:, :_POSE].mT)
+        # Products with the poses, such that squares of them are what poses explain.
+        by_pose = torch.linalg.solve_triangular(whole.pose, (moving @ rows[:, :_POSE].mT).mT, upper=False).mT
         cross = -by_pose @ whole.half
         cross[..., torch.cat([shared, shared.new_tensor([-1])])] += moving @ rows[:, _POSE:].mT
-        felt = whole.combined(cross[..., :-1].flatten(0, 1).T)
+        by_shared = cross[..., :-1].flatten(0, 1).T * whole.scale[:, None]
+        felt = torch.linalg.solve_triangular(whole.root, by_shared, upper=False)
         pull, square, freedom = whole.pull, whole.square, float(whole.freedom)
         if felt.shape[1] < len(felt):
             basis, felt = torch.linalg.qr(felt)
@@ -213,7 +215,8 @@ class RigRows:
         cross = torch.cat([felt.T.unflatten(0, (len(moving), -1)), cross[..., -1:]], -1)
         own = moving @ moving.mT - by_pose @ by_pose.mT
         data = ViewData(still=still, own=own, cross=cross, score=pull.new_zeros(len(moving), size))
-        return data, _hardly_known(torch.full_like(pull, _WIDE))
+        zero, none = torch.zeros_like(pull), torch.full(pull.shape, -1)
+        return data, PriorFamilies(zero, torch.full_like(pull, math.log(_WIDE)), none, none, zero)
 
 
 class _Whole(NamedTuple):
@@ -261,20 +264,6 @@ class _Whole(NamedTuple):
         inverse = torch.linalg.solve_triangular(root, torch.diag((length > 0).to(root.dtype)), upper=False)
         determined = int((length > 0).sum()) - weak * float(inverse.square().sum())
         return cls(pose, half, unit, root, pull, determined, count, square, variance)
-
-    def off_pose(self, by_pose: Tensor) -> Tensor:
-        """Products (V, M, 6) of other unknowns with the poses, such that squares of them are what poses explain."""
-        return torch.linalg.solve_triangular(self.pose, by_pose.mT, upper=False).mT
-
-    def combined(self, by_shared: Tensor) -> Tensor:
-        """Products (S, M) with what boards share as products with combinations of unit weight."""
-        return torch.linalg.solve_triangular(self.root, by_shared * self.scale[:, None], upper=False)
-
-
-def _hardly_known(deviation: Tensor) -> PriorFamilies:
-    """Priors of unknowns about zero with these standard deviations."""
-    none = torch.full(deviation.shape, -1)
-    return PriorFamilies(torch.zeros_like(deviation), deviation.log(), none, none, torch.zeros_like(deviation))
 
 
 class WithoutMotion:

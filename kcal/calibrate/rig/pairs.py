@@ -15,11 +15,9 @@ import torch
 from torch import Tensor
 
 from kcal.bag import pair_stamps, stamp_in
-from kcal.calibrate.problem.poses import poses_under, refine_poses
 from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.problem.views import Views
-from kcal.calibrate.rig.boards import Boards
-from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.problem.views import Views, poses_under, refine_poses
+from kcal.calibrate.rig.sources import Boards, RigData
 from kcal.corners.board import Board
 from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations

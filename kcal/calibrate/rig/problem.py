@@ -15,7 +15,7 @@ from kcal.checks import variance_factor
 from kcal.gaussian import Covariance
 from kcal.lens.camera import Camera
 from kcal.lens.pose import nearest_rotation, rotation_from_vector
-from kcal.solve.problem import RobustLoss, State
+from kcal.solve.lm import RobustLoss, State
 from kcal.solve.schur import EliminatedItems, PartlyEliminated, SchurLinearization
 
 # The least-squares problem of a rig: cameras that move or are held, what they see, and what was measured besides.
@@ -297,25 +297,22 @@ class GoodnessOfFit(NamedTuple):
     Attributes:
         chi2: sum of squares of all residuals over their sigmas.
         freedom: degrees of freedom.
-        variance: by which covariances are to be multiplied: χ² per degree of freedom where that is larger than chance
-            explains, otherwise 1.
     """
 
     chi2: float
     freedom: int
-    variance: float
 
-    @classmethod
-    def of(cls, chi2: float, freedom: int) -> GoodnessOfFit:
-        """From χ² and its degrees of freedom."""
-        return cls(chi2, freedom, variance_factor(chi2, freedom))
+    @property
+    def variance(self) -> float:
+        """By which covariances are to be multiplied: χ² / freedom where chance does not explain that, otherwise 1."""
+        return variance_factor(self.chi2, self.freedom)
 
 
 def goodness_of_fit(problem: RigProblem, state: RigState) -> GoodnessOfFit:
     """Compare the residuals at a minimum with their sigmas."""
     counted = sum(int((block.counts - block.size).sum()) for block in problem.blocks)
     freedom = counted + problem.term_rows(state).shape[1] - problem.shared_size
-    return GoodnessOfFit.of(2.0 * float(problem.cost(state)), freedom)
+    return GoodnessOfFit(2.0 * float(problem.cost(state)), freedom)
 
 
 # How well each source of a rig fits itself: what its items leave over where nothing else is known of the cameras.
@@ -364,5 +361,5 @@ def own_fits(problem: RigProblem, state: RigState) -> dict[str, GoodnessOfFit]:
         if not block.many:
             alone = least(gram + known)
             rows = int((block.counts - block.size).sum()) + prior.shape[1]
-            found[block.kind] = GoodnessOfFit.of(alone.chi2, rows - alone.rank)
+            found[block.kind] = GoodnessOfFit(alone.chi2, rows - alone.rank)
     return found

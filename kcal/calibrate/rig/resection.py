@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcal.lens.turning import rotation_between
+from kcal.lens.pose import rotation_between
 
 # Every pose from three points (or, where the position is known, from two directions) is tried, and the one that the
 # other points agree with best is taken, so that wrong points do no harm while they are the minority.

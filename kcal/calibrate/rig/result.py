@@ -25,8 +25,7 @@ from kcal.io.rig_file import save_rig
 from kcal.lens.calibration import Exclusion, ItemResidual, RigCalibration, RigSource
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin, Rig, RigCovariance
-from kcal.solve.lm import LMOptions
-from kcal.solve.problem import SolverStatus
+from kcal.solve.lm import LMOptions, SolverStatus
 from kcal.texts import brief
 
 # The result of solving a rig: cameras, residuals by source and by item, what was left out and why, covariances.

@@ -15,11 +15,10 @@ from torch import Tensor
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters
-from kcal.calibrate.problem.poses import spread_out
 from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import spread_out
 from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, all_of, possible
 from kcal.calibrate.rig.assess import rig_result
-from kcal.calibrate.rig.boards import MINIMUM_CORNERS, Boards
 from kcal.calibrate.rig.explanations import (
     cost_of_features_behind,
     explained,
@@ -29,7 +28,7 @@ from kcal.calibrate.rig.explanations import (
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
 from kcal.calibrate.rig.pairs import Pair, evenly, paired_boards, pose_alone
 from kcal.calibrate.rig.result import Reasons, RigResult, records
-from kcal.calibrate.rig.sources import RigData
+from kcal.calibrate.rig.sources import MINIMUM_CORNERS, Boards, RigData
 from kcal.calibrate.rig.unknowns import SharedUnknowns, deviation_of, free, gathered, held, joint_unknowns, less
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
@@ -92,7 +91,9 @@ def robust_solution(initial: InitialPoses, mask: Tensor, unknowns: SharedUnknown
     for start in initial.starts:
         work = Adjustment(initial.data, start, unknowns, sigma)
         some, features = mask.clone(), work.at("features")
-        some[features] = _evenly_taken(mask[features], _SCREENED)
+        taken = mask[features].nonzero()[:, 0]
+        some[features] = False
+        some[features.start + taken[evenly(len(taken), _SCREENED)]] = True
         if unknowns.refine_lenses:
             # From poses that are far off, lenses would bend towards them, beyond their folds even.
             work.unknowns = unknowns.none()
@@ -109,13 +110,6 @@ def robust_solution(initial: InitialPoses, mask: Tensor, unknowns: SharedUnknown
     work.fit_corners(here, robust=True)
     work.solve(here, ROUGHLY, LOSS)
     return work
-
-
-def _evenly_taken(mask: Tensor, most: int) -> Tensor:
-    """The mask with `most` of its items at most, evenly taken."""
-    chosen, out = mask.nonzero()[:, 0], torch.zeros_like(mask)
-    out[chosen[evenly(len(chosen), most)]] = True
-    return out
 
 
 # Take views of a rig out of what the cameras' calibrations know of them, so that no corner counts twice.
@@ -360,7 +354,9 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
     else:
         names = [" and ".join(data.names[c] for c in at) for at in places.values()]
         unknowns = held(cameras) if options.intrinsics == "fixed" else free(cameras, names)
-    unknowns = unknowns.at_places([list(places).index(lens) for lens in data.lenses])
+    # The same lens has the same unknowns at all places.
+    each = tuple(unknowns.cameras[list(places).index(lens)] for lens in data.lenses)
+    unknowns = dataclasses.replace(unknowns, cameras=each)
     if boards is not None:
         doubts += one_camera_doubts(data)
     if options.board_warp and boards is not None and not len(unknowns.shapes):

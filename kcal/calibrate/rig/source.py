@@ -63,7 +63,7 @@ class Start(NamedTuple):
     Attributes:
         rotation: (C, 3, 3) cam_from_world.
         center: (C, 3) meters.
-        boards: (V, 12) where boards are; see `kcal.calibrate.rig.boards.board_pose`.
+        boards: (V, 12) where boards are; see `kcal.calibrate.rig.sources.board_pose`.
     """
 
     rotation: Tensor
@@ -490,22 +490,21 @@ class MarkBlock(Block):
         pixels: (V, C, 2), NaN where not seen.
         whitening: (V, C, 2, 2) by which pixel residuals are multiplied.
         effects: of the items; None without any.
+        priors: (V,) residuals of what is known of each item beforehand, or as many of each.
     """
 
-    def __init__(self, pixels: Tensor, whitening: Tensor, effects: Effects | None = None) -> None:
+    def __init__(
+        self, pixels: Tensor, whitening: Tensor, effects: Effects | None = None, priors: Tensor | int = 0
+    ) -> None:
         super().__init__(pixels[:, :, None])
-        self._effects = effects
+        self._effects, self._priors = effects, priors
         self._target = torch.where(self.seen, pixels, 0.0)[..., None]
         self._whitening = torch.where(self.seen[..., None], whitening, 0.0)[..., None]
 
     @property
     def counts(self) -> Tensor:
         """See `Block.counts`."""
-        return super().counts + self._prior_count()
-
-    def _prior_count(self) -> Tensor:
-        """(V,) residuals of what is known of each item beforehand."""
-        return torch.zeros(len(self), dtype=torch.int64)
+        return super().counts + self._priors
 
     @abstractmethod
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:

@@ -122,9 +122,10 @@ def relative_rows(problem: RigProblem, state: RigState, first: int, second: int)
     """(6, S): the step (ω, v) of second_from_first (see `apply_twist`) by a step of the shared unknowns."""
     rotation, center = state.rotation, state.center
     shift = rotation[second] @ (center[first] - center[second])
-    by_second = turn_rows(problem, second)
-    turned = by_second - rotation[second] @ rotation[first].T @ turn_rows(problem, first)
-    moved = rotation[second] @ (_shift_rows(problem, first) - _shift_rows(problem, second))
+    by_first, by_second = (slot_rows(problem, problem.turn[c]) for c in (first, second))
+    turned = by_second - rotation[second] @ rotation[first].T @ by_first
+    moved, other = (slot_rows(problem, problem.shift[c]) for c in (first, second))
+    moved = rotation[second] @ (moved - other)
     # ω × shift, column by column.
     return torch.cat([turned, moved + torch.linalg.cross(by_second, shift[:, None].expand_as(by_second), dim=0)])
 
@@ -134,19 +135,12 @@ def mounting_rows(problem: RigProblem, state: RigState, camera: int) -> Tensor:
     bending = torch.zeros(1, problem.shared_size, dtype=torch.float64)
     if problem.unknowns.by_refraction is not None:
         bending[0, : len(problem.unknowns)] = problem.unknowns.by_refraction
-    return torch.cat([_shift_rows(problem, camera), -state.rotation[camera].T @ turn_rows(problem, camera), bending])
+    turn, shift = (slot_rows(problem, slots[camera]) for slots in (problem.turn, problem.shift))
+    return torch.cat([shift, -state.rotation[camera].T @ turn, bending])
 
 
-def turn_rows(problem: RigProblem, camera: int) -> Tensor:
-    """(3, S): turn of a camera about its own axes."""
-    return _slot_rows(problem, problem.turn[camera])
-
-
-def _shift_rows(problem: RigProblem, camera: int) -> Tensor:
-    return _slot_rows(problem, problem.shift[camera])
-
-
-def _slot_rows(problem: RigProblem, slot: slice | None) -> Tensor:
+def slot_rows(problem: RigProblem, slot: slice | None) -> Tensor:
+    """(3, S): the turn of a camera about its own axes, or the shift of its center, by its slot; None: it is held."""
     rows = torch.zeros(3, problem.shared_size, dtype=torch.float64)
     if slot is not None:
         rows[:, slot] = _IDENTITY

@@ -66,10 +66,6 @@ class SharedUnknowns:
         cameras, nothing = tuple(by[:, :0] for by in self.cameras), held(())
         return dataclasses.replace(nothing, cameras=cameras, shapes=self.shapes, board=self.board[:, :0])
 
-    def at_places(self, lenses: Sequence[int]) -> SharedUnknowns:
-        """These for places, given the number of the lens that is used at each: the same lens has the same unknowns."""
-        return dataclasses.replace(self, cameras=tuple(self.cameras[lens] for lens in lenses))
-
     def and_warp(self, board_points: Tensor) -> SharedUnknowns:
         """These, and two parabolas by which the board bends."""
         labels = "the board's warp along its rows", "the board's warp along its columns"

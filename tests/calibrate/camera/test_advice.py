@@ -22,7 +22,7 @@ from kcal.calibrate.camera.advice import (
 from kcal.calibrate.camera.warnings import corner_pupil, pupil_findings
 from kcal.finding import sentences
 from kcal.lens import LensModel, rotation_from_vector
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 
 BOARD = Board(columns=2, rows=2, square=0.1)

@@ -15,7 +15,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibratio
 from kcal.calibrate.camera.solve import first_states, follow_base
 from kcal.calibrate.problem.views import CameraViews
 from kcal.lens import LensModel
-from kcal.lens.hybrid_terms import radius_over_angle
+from kcal.lens.model import radius_over_angle
 from scripts.shared.distorted import distort
 
 TRUTH = camera("opencv14")

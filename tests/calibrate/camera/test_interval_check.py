@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 
-import kcal.calibrate.camera.interval_check as module
+import kcal.calibrate.camera.trust as module
 from kcal import Camera, Observations, calibrate_camera
-from kcal.calibrate.camera.interval_check import interval_check, simulated_refits
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
+from kcal.calibrate.camera.trust import interval_check, simulated_refits
 from kcal.cli.main import main
 from kcal.finding import Finding
 from kcal.lens import CameraCalibration

@@ -21,8 +21,8 @@ from kcal.calibrate.hybrid.fitted_views import hybrid_problem
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_board, off_by, save_measured_board
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.rig.boards import Boards
 from kcal.calibrate.rig.solve import without_repeated
+from kcal.calibrate.rig.sources import Boards
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions
 from kcal.solve.schur import Products

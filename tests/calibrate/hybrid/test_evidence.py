@@ -25,8 +25,7 @@ from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.hybrid.fitted_views import hybrid_problem, hybrid_unknowns
 from kcal.calibrate.problem.state import AMPLITUDES, MEDIAN, MOTION, SPREAD
 from kcal.corners.board import Board
-from kcal.lens.hybrid_terms import HybridForm
-from kcal.lens.model import LensModel
+from kcal.lens.model import HybridForm, LensModel
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.schur import Products
 

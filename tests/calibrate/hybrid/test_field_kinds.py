@@ -15,7 +15,7 @@ from kcal.calibrate.hybrid.families import SQUARE, prior_families, typical_hyper
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.lens import rotation_from_vector
 from kcal.lens.field_modes import FieldModes, GaussianModes, NetworkModes
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 
 BOARD = Board(columns=8, rows=6, square=0.05)

@@ -33,8 +33,8 @@ from kcal.calibrate.problem.state import Readout
 from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.camera import Camera
-from kcal.lens.hybrid_terms import HybridForm
 from kcal.lens.information import BOARD_SLOT
+from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 
 BOARD = Board(columns=8, rows=6, square=0.03)

@@ -25,7 +25,7 @@ from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, rough_s
 from kcal.calibrate.hybrid.fitted_views import hybrid_problem
 from kcal.calibrate.problem.state import BoardState
 from kcal.lens import LensModel, rotation_from_vector
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.captures import drawn_lens
 from kcal.solve.lm import LMOptions, minimize
@@ -209,7 +209,7 @@ def linear_case() -> tuple[Quadratic, PriorFamilies]:
 
 
 def _form():
-    from kcal.lens.hybrid_terms import HybridForm
+    from kcal.lens.model import HybridForm
 
     return HybridForm(shape=0.4, radius=1.1)
 

@@ -22,7 +22,7 @@ from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_bo
 from kcal.calibrate.problem.state import BoardState
 from kcal.gaussian import Gaussian
 from kcal.lens import LensModel
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.schur import Products
 

@@ -15,8 +15,7 @@ from kcal.calibrate.problem.parameters import GaussianPrior
 from kcal.calibrate.problem.state import BoardState, warp_modes
 from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.projection import parameter_names
-from kcal.solve.lm import LevenbergMarquardt, LMOptions, minimize
-from kcal.solve.problem import RobustLoss, SolverStatus, map_state
+from kcal.solve.lm import LevenbergMarquardt, LMOptions, RobustLoss, SolverStatus, map_state, minimize
 from kcal.solve.schur import SchurLinearization
 
 BOARD = Board(columns=4, rows=3, square=0.1)

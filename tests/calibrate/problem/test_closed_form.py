@@ -14,7 +14,9 @@ from kcal import Board, Camera, InputError
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.problem.board_problem import apply_twist
 from kcal.calibrate.problem.parameters import CoefficientPrior, is_overparameterized
-from kcal.calibrate.problem.poses import (
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import (
+    Views,
     flipped_poses,
     homographies,
     poses_from_homographies,
@@ -22,9 +24,8 @@ from kcal.calibrate.problem.poses import (
     refine_poses,
     spread_out,
     unflip,
+    whitening,
 )
-from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.problem.views import Views, whitening
 from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.camera_parameters import parameter_names
 from kcal.lens.projection import project_components

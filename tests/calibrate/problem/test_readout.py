@@ -34,7 +34,7 @@ from kcal.calibrate.problem.state import (
     widening,
 )
 from kcal.lens import LensModel, rotation_from_vector
-from kcal.lens.hybrid_terms import HybridForm
+from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.schur import Products, without_local

@@ -13,7 +13,7 @@ from torch import Tensor
 from kcal import Baseline, DegenerateError, InputError, Landmarks, MeasuredPosition, RigData, RigOptions, solve_rig
 from kcal.calibrate.rig import assess
 from kcal.calibrate.rig.adjustment import Adjustment
-from kcal.calibrate.rig.explanations import contradictions, redundancy
+from kcal.calibrate.rig.explanations import contradiction, redundancy
 from kcal.calibrate.rig.initial_poses import first_poses
 from kcal.calibrate.rig.resection import distinct_poses, poses_from_three
 from kcal.calibrate.rig.unknowns import held
@@ -223,7 +223,7 @@ class TestContradictions:
         sources = data(landmarks=marked(), baselines=baseline(1.01 * APART, 0.005))
         whole, without = adjusted(sources), adjusted(dataclasses.replace(sources, baselines=()))
         problem, state = (whole[0].problem(whole[1]), whole[0].part(whole[1]))
-        (found,) = contradictions(whole[0], problem, state)
+        found = contradiction(whole[0], problem, state)
         chi2 = [2.0 * float(work.problem(masks).cost(work.part(masks))) for work, masks in (whole, without)]
         assert found.sigmas == pytest.approx(math.sqrt(chi2[0] - chi2[1]), rel=0.02)
 

@@ -16,10 +16,10 @@ from torch import Tensor
 from kcal import Board, Camera, InputError, Observations, RigOptions, calibrate_camera, calibrate_rig
 from kcal.calibrate.hybrid.evidence import EvidenceLoss, view_data
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
-from kcal.calibrate.rig.boards import BoardBlock
 from kcal.calibrate.rig.motion import CameraRows, RigRows, WithoutMotion
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.source import PosedCamera, RigState, as_items
+from kcal.calibrate.rig.sources import BoardBlock
 from kcal.calibrate.rig.unknowns import held
 from kcal.lens import CameraCalibration
 from kcal.lens.pose import Pose, rotation_from_vector, vector_from_rotation

@@ -13,7 +13,7 @@ from torch import Tensor
 from kcal import Baseline, InputError, Landmarks, RigData, RigOptions, solve_rig
 from kcal.calibrate.rig.problem import own_fits
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.uncertainty import turn_rows
+from kcal.calibrate.rig.uncertainty import slot_rows
 from kcal.lens import vector_from_rotation
 
 LENGTH = float((CENTER[1] - CENTER[0]).norm())
@@ -41,7 +41,7 @@ def solved(noise: float, seed: int, matches: int = 300, length: float = LENGTH) 
 def over_sigma(found: RigResult) -> Tensor:
     """(3,) error of the left camera's attitude over its standard deviation."""
     error = vector_from_rotation(found.rotation[0] @ ROTATION[0].T)
-    return error / found._covariance.variances(turn_rows(found._problem, 0)).sqrt()
+    return error / found._covariance.variances(slot_rows(found._problem, found._problem.turn[0])).sqrt()
 
 
 def of(found: RigResult, source: str) -> float:

@@ -25,13 +25,12 @@ from torch import Tensor
 
 from kcal import Baseline, DegenerateError, MeasuredPosition
 from kcal.calibrate.rig.assess import _advice, _Targets
-from kcal.calibrate.rig.boards import BoardBlock
 from kcal.calibrate.rig.explanations import _Part, _test, least_redundancy, redundancy, refuse_exact
-from kcal.calibrate.rig.features import FeatureBlock
-from kcal.calibrate.rig.landmarks import LandmarkBlock
+from kcal.calibrate.rig.marks import FeatureBlock, LandmarkBlock
 from kcal.calibrate.rig.motion import CameraRows, summed_products
 from kcal.calibrate.rig.problem import RigProblem, _of_item, least
 from kcal.calibrate.rig.source import Block, Measurement, RigState, Start, as_items, first_rays, typical_ratio
+from kcal.calibrate.rig.sources import BoardBlock
 from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, relative_rows
 from kcal.calibrate.rig.unknowns import _moving, held
 from kcal.checks import chi2_quantile

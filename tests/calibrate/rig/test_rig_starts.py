@@ -35,8 +35,7 @@ from kcal.calibrate.rig.resection import (
     poses_from_three,
 )
 from kcal.calibrate.rig.source import Start
-from kcal.lens.pose import Pose, rotation_from_vector
-from kcal.lens.turning import rotation_between
+from kcal.lens.pose import Pose, rotation_between, rotation_from_vector
 from kcal.report.judge_rig import synchrony
 
 

@@ -27,23 +27,22 @@ from rig_scenes import (
 from torch import Tensor
 
 from kcal import Baseline, MeasuredPosition, RigData
-from kcal.calibrate.rig import boards as board_limits
 from kcal.calibrate.rig import initial_poses, solve
-from kcal.calibrate.rig.boards import BoardBlock
-from kcal.calibrate.rig.features import FeatureBlock, inverse_range_beyond
-from kcal.calibrate.rig.landmarks import LandmarkBlock
+from kcal.calibrate.rig import sources as board_limits
+from kcal.calibrate.rig.marks import FeatureBlock, LandmarkBlock, inverse_range_beyond
 from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import PosedCamera, RigState, Start, as_items
+from kcal.calibrate.rig.sources import BoardBlock
 from kcal.calibrate.rig.unknowns import SharedUnknowns, joint_unknowns
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.pose import rotation_from_vector, vector_from_rotation
-from kcal.solve.problem import SolverStatus
+from kcal.solve.lm import SolverStatus
 
 APART = float((CENTER[0] - CENTER[1]).norm())
 BASELINE = (Baseline(first=0, second=1, length=APART, sigma=0.005),)
