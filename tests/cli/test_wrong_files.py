@@ -79,6 +79,7 @@ FILES = {
 # Of these, a file of the other kind will do as well, or the reader says more of what is wrong in it.
 FINE = {
     ("picture.png", "folder"), ("picture.png", "empty.json"), ("picture.png", "foreign.yaml"),
+    ("foreign.yaml", "picture.png"),
     ("survey.csv", "other.json"), ("right.json", "camera.json"), ("rig.json", "camera.json:left"),
     *itertools.product(["foreign.yaml"], ["camera.json", "rig.json", "marks.csv", "survey.csv", "other.json"]),
 }  # fmt: skip
