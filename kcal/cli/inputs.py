@@ -210,8 +210,8 @@ VIDEO = dataclasses.replace(
 )
 VIEWED = dataclasses.replace(
     OBSERVATIONS,
-    words="marks, positions, landmarks, observations or an image",
-    kinds=MARKS.kinds | {"survey", "observations", "image"},
+    words="marks, detections, positions, landmarks, observations or an image",
+    kinds=MARKS.kinds | {"survey", "observations", "image", "foreign", "json"},
 )
 FOREIGN = Wanted(
     "a file of another program",

@@ -134,9 +134,10 @@ def view_command(
 ) -> None:
     """Write a scene for the 3-D viewer rerun: cameras with the field of view of their lenses, and what they saw.
 
-    Files may be, in any order: tables of marks, which are located; positions that `kcal locate` or `kcal live` has
-    written as CSV; landmarks; and for each camera, in the rig's order, its observations, or an image. Positions have
-    ellipsoids that contain the true ones with 95 %, and a column `time` becomes the viewer's timeline.
+    Files may be, in any order: tables of marks, or a detector's lines as for `kcal live --detections`, which are
+    located; positions that `kcal locate` or `kcal live` has written as CSV; landmarks; and for each camera, in the
+    rig's order, its observations, or an image. Positions have ellipsoids that contain the true ones with 95 %, and a
+    column `time` becomes the viewer's timeline.
 
     The viewer is an extra, `pip install 'kcal[view]'`. kcal sends nothing; `rerun analytics disable` keeps the viewer
     from counting how it is used.
@@ -144,6 +145,8 @@ def view_command(
     **Examples**
 
     `kcal view rig.json points.csv -o scene.rrd --open`
+
+    `kcal view rig.json boxes.jsonl -o tracks.rrd`
 
     `kcal view left.camera.json left.obs.json -o boards.rrd`
 
@@ -193,25 +196,32 @@ def _rig_of(source: str) -> kcal.Rig:
 
 
 def _of_table(file: Path, localize: kcal.Localizer, note: str) -> Located | Survey:
-    """Positions as they were written, marks as they are located now, or landmarks."""
+    """Positions as they were written, marks or a detector's lines as they are located now, or landmarks."""
     import torch
 
     from kcal.locate.export import read_positions
-    from kcal.locate.marks import is_long, read_mark_chunks
+    from kcal.locate.marks import Marks, is_long, read_mark_chunks
     from kcal.locate.points import PointLocator
     from kcal.locate.positions import STATUS_NAMES
     from kcal.locate.survey import read_survey
     from kcal.locate.tables import PositionColumns, header_of
+    from kcal.pipeline.grouping import marks_of_lines
 
     locate = PointLocator(localize)
-    if "status" in header_of(file):
+    kind = "lines" if file_kind(file) in ("foreign", "json") else file_kind(file)
+    if kind != "lines" and "status" in header_of(file):
         located = read_positions(file, locate)
-    elif file_kind(file) == "survey":
+    elif kind == "survey":
         return read_survey(file, localize.origin, measured=False)
     else:
-        names, single = localize.rig.names, localize.weights == "all" or is_long(file)
+        names, single = localize.rig.names, localize.weights == "all"
+        if kind == "lines":
+            chunks: Iterable[Marks] = [marks_of_lines(file, localize)]
+        else:
+            single = single or is_long(file)
+            chunks = (marks for marks, _ in read_mark_chunks(file, names, single=single))
         locate = PointLocator(localize.weighing_all()) if single else locate
-        parts, feet = zip(*(locate(marks) for marks, _ in read_mark_chunks(file, names, single=single)), strict=True)
+        parts, feet = zip(*map(locate, chunks), strict=True)
         located = locate.located(PositionColumns.joined(parts), torch.cat(feet) if single else None)
         if note:
             err.print(note)

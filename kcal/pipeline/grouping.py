@@ -6,6 +6,7 @@ import copy
 import itertools
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.errors import InputError
+from kcal.files import read_text
 from kcal.lens.rig import Rig
 from kcal.locate.localizer import Localizer
+from kcal.locate.marks import Marks
 from kcal.pipeline.assignment import assign_groups
 from kcal.pipeline.association import MOST_BOXES, AssociationOptions, fit_some, pair_costs
 from kcal.pipeline.detections import Detections
@@ -410,6 +413,35 @@ def read_moment(line: str | bytes, rig: Rig | Localizer, options: AssociationOpt
             raise InputError("detections of both images need a time")
         return Moment(left.time, pair_objects(rig, left, right, options=options))
     return _pairs_of_line(content, pixel_sigma)
+
+
+def marks_of_lines(path: Path, localize: Localizer) -> Marks:
+    """What a detector saw, as marks with their `time`: a row for each object of each line (`read_moment`).
+
+    Raises:
+        InputError: a line that cannot be read, or none that shows anything.
+    """
+    rig = localize.rig
+    paired = rig if rig.is_pair and rig.names == ("left", "right") else localize
+    noise = float(localize.pixel_sigma)
+    seen = []
+    for number, line in enumerate(read_text(path, 2**30).splitlines(), 1):
+        if line.strip():
+            try:
+                seen.append(read_moment(line, paired, AssociationOptions(), noise).pairs)
+            except InputError as error:
+                raise InputError(f"{path}: line {number}: {error}") from None
+    names = [track or kind for views in seen for track, kind in zip(views.track, views.category, strict=True)]
+    if not names:
+        raise InputError(f"{path}: nothing was seen by the cameras in {len(seen)} lines")
+    # Of the first camera that saw it.
+    first = torch.cat([views.time.gather(1, views.seen.int().argmax(1, keepdim=True))[:, 0] for views in seen])
+    return Marks(
+        [f"{name} {number}" for number, name in enumerate(names, 1)],
+        torch.cat([views.pixels.masked_fill(~views.seen[..., None], torch.nan) for views in seen]),
+        torch.cat([views.covariance for views in seen]),
+        extras={"time": [repr(time) for time in first.tolist()]},
+    )
 
 
 def _named_cameras(content: Any, localize: Localizer, options: AssociationOptions) -> Moment:

@@ -60,6 +60,29 @@ def test_marks_and_the_positions_of_them_are_one_scene(command: Command) -> None
     assert np.linalg.norm(centers("marks.rrd")[2]) == pytest.approx(4000.0, rel=0.02)
 
 
+def test_lines_of_a_detector_are_located_at_their_times(command: Command) -> None:
+    """The last one too, that has no end of line, as marks with the same noise."""
+    rows = [row.split(",") for row in Path("points.csv").read_text().splitlines()[1:]]
+    lines = [
+        f'{{"time": {time}, "left": [[{", ".join(numbers[:2])}]], "right": [[{", ".join(numbers[2:])}]], "sigma": 0.3}}'
+        for _, *numbers, time in rows
+    ]
+    Path("lines.jsonl").write_text("\n\n".join(lines))
+    assert "lines.jsonl: 3 rows: 3 ok" in command("view rig.json lines.jsonl --pixel-sigma 0.3 -o lines.rrd").out
+    command("view rig.json points.csv --pixel-sigma 0.3 -o marks.rrd")
+    assert np.abs(np.array(centers("lines.rrd")) - np.array(centers("marks.rrd"))).max() < 1e-3
+    assert "/targets/at\\ all\\ times" in entities("lines.rrd")
+    Path("boxes.jsonl").write_text(
+        '{"left": {"time": 1.0, "boxes": [[500, 500, 510, 510]]}, "right": {"time": 1.0, "boxes": []}}\n{"left": 1}\n'
+    )
+    assert "boxes.jsonl: line 2: " in command("view rig.json boxes.jsonl -o no.rrd", code=1).err
+    Path("boxes.jsonl").write_text(Path("boxes.jsonl").read_text().splitlines()[0])
+    assert (
+        "boxes.jsonl: nothing was seen by the cameras in 1 lines"
+        in command("view rig.json boxes.jsonl -o no.rrd", code=1).err
+    )
+
+
 def test_of_a_rig_that_stands_nowhere_in_its_own_frame(command: Command) -> None:
     command("locate own.rig.json points.csv -o own.csv")
     command("view own.rig.json own.csv -o own.rrd")
