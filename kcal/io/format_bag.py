@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from kcal.bag import TF, Bag, message_types, open_bag
-from kcal.errors import with_extra
+from kcal.errors import InputError, with_extra
 from kcal.files import write_atomic
 from kcal.io.foreign import Hints, ImportedCameras, camera_name, checked_pose, plain
 from kcal.io.format_opencv import ros_camera, ros_values
@@ -107,7 +107,12 @@ def write_bag(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> l
     """Write `/NAME/camera_info` of each camera, and with poses `/tf_static`: `rig` → `NAME_optical_frame`.
 
     A `.bag` is one of ROS 1, `.mcap` and `.db3` are of ROS 2. Late subscribers get all of it, as from a driver.
+
+    Raises:
+        InputError: another suffix, or rosbags is not installed.
     """
+    if path.suffix.lower() not in (".bag", ".mcap", ".db3"):
+        raise InputError(f"{path}: the suffix says which bag it will be: .bag (ROS 1), .mcap or .db3 (ROS 2)")
     from scipy.spatial.transform import Rotation
 
     with with_extra("ros", "bags need"):

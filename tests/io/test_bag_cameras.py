@@ -249,3 +249,5 @@ def test_refusals(tmp_path: Path) -> None:
         import_cameras(text)
     with pytest.raises(InputError, match="opencv14"):
         export_cameras(rig(1).each[0], tmp_path / "x.bag", model="opencv14")
+    with pytest.raises(InputError, match=r"x\.json: the suffix says which bag"):
+        export_cameras(rig(1).each[0], tmp_path / "x.json", format="bag")
