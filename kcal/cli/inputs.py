@@ -57,14 +57,13 @@ def picked(found: ImportedCameras, name: str | None, source: str) -> kcal.Camera
 def cameras_and_rig(path: Path) -> tuple[ImportedCameras, kcal.Rig | None]:
     """The cameras of a file of any program, and the rig that they are, if they are one."""
     from kcal.io.formats import recognized
-    from kcal.io.rig_file import load_pair
 
     found = kcal.lens.import_cameras(path)
     warn(*found.notes)
     if len(found.cameras) == 1:
         return found, None
     if recognized(path) == "kcal":
-        return found, load_pair(path)
+        return found, kcal.load_rig(path)
     return found, found.rig() if found.is_rig() else None
 
 

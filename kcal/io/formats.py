@@ -34,7 +34,7 @@ from kcal.io.foreign import (
     rig_poses,
 )
 from kcal.io.keyed import speaks_of_camera
-from kcal.io.rig_file import load_pair
+from kcal.io.rig_file import load_rig
 from kcal.lens.camera import Camera
 from kcal.lens.camera_conversions import OPENCV_MODELS, size_doubt
 from kcal.lens.model import LensModel
@@ -397,6 +397,6 @@ def _imported(path: Path, name: str | None, hints: Hints) -> ImportedCameras:
     with reading(path, "kcal"):
         kind = read_json(read_text(path, MOST_JSON).encode(), str(path))["kcal"]
     if kind == "rig":
-        rig = load_pair(path)
-        return ImportedCameras(format="kcal", cameras=(rig.left, rig.right), poses=rig_poses(rig))
+        rig = load_rig(path)
+        return ImportedCameras(format="kcal", cameras=tuple(rig.each), poses=rig_poses(rig))
     return ImportedCameras(format="kcal", cameras=(load_camera(path),))

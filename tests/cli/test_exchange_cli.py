@@ -32,6 +32,18 @@ def camera(tmp_path: Path) -> Path:
     return save_camera(known, tmp_path / "a.json")
 
 
+def test_a_rig_of_three_cameras_goes_there_and_back(tmp_path: Path, camera: Path) -> None:
+    one = load_camera(camera)
+    one.calibration = None
+    aside = torch.tensor([[0.0, 0, 0], [-1, 0, 0], [-2, 0, 0.1]], dtype=torch.float64)
+    rig = Rig([one] * 3, ["a", "b", "c"], torch.eye(3, dtype=torch.float64).expand(3, 3, 3), aside)
+    path = save_rig(rig, tmp_path / "three.json")
+    run("export", path, "--format", "toml", "-o", tmp_path / "three.toml")
+    assert "rig from toml: a, b, c" in run("import", tmp_path / "three.toml", "-o", tmp_path / "back.json")
+    back = load_rig(tmp_path / "back.json")
+    assert float((back.translation - back.translation[0] - aside).abs().max()) < 1e-12
+
+
 def test_there_and_back(tmp_path: Path, camera: Path) -> None:
     text = run("export", camera, "-o", tmp_path / "a.yaml")
     assert "north: opencv5, exact" in text
