@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from scipy.stats import chi2 as chi2_of
 from torch import Tensor
 
 from kcal.checks import as_points
@@ -623,7 +622,9 @@ def _noisier(covariance: Callable[[Tensor], Tensor], error: Tensor) -> Cause:
 
 def _chance(chi2: float, freedom: int) -> float:
     """Probability of a χ² as large or larger; 1 without freedom."""
-    return float(chi2_of.sf(max(chi2, 0.0), freedom)) if freedom else 1.0
+    from scipy.special import chdtrc  # which few need
+
+    return float(chdtrc(freedom, max(chi2, 0.0))) if freedom else 1.0
 
 
 _CURES = {

@@ -7,10 +7,9 @@ import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pyproj
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -22,10 +21,14 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting
 from kcal.locate.geodesy import anchor, enu_from_cam, mean_radius, place_enu
 from kcal.locate.mounting import by_mounting
-from kcal.locate.stereo import QUANTILE, PositionStatus, status_counts
-from kcal.locate.tabulate import covariance_root
+from kcal.locate.stereo import QUANTILE, PositionStatus, covariance_root, status_counts
 from kcal.locate.views import StatedHeight
 from kcal.texts import brief
+
+if TYPE_CHECKING:
+    import pyproj
+
+    _Read = tuple[NDArray[np.float64], tuple[float, float, float, float, float, float], pyproj.CRS]
 
 # Rasters of ground heights, which `terrain` reads: GeoTIFF and what else rasterio knows, or an ESRI ASCII grid.
 
@@ -115,6 +118,8 @@ def terrain(path: str | Path, geoid_height: float = 0.0) -> Raster:
     """
     if not math.isfinite(geoid_height):
         raise InputError(f"geoid height {geoid_height}: finite meters are needed")
+    import pyproj  # which a rig without terrain does not need
+
     read_head(path, 0)
     read = _read_grid if Path(path).suffix.lower() == ".asc" else _read_raster
     heights, to_cell, system = read(Path(path))
@@ -145,9 +150,6 @@ def terrain(path: str | Path, geoid_height: float = 0.0) -> Raster:
     return Raster(heights, to_cell, into, min(sides))
 
 
-_Read = tuple[NDArray[np.float64], tuple[float, float, float, float, float, float], pyproj.CRS]
-
-
 def _check_cells(path: Path, columns: int, rows: int) -> None:
     if columns * rows > _MOST_CELLS:
         raise FileError(f"{path}: {columns} x {rows} cells; at most {_MOST_CELLS:,} are read: cut out what is needed")
@@ -172,6 +174,8 @@ def _read_raster(path: Path) -> _Read:
 
 def _coordinate_system(path: Path, text: str) -> pyproj.CRS:
     """A coordinate system that positions can be turned into."""
+    import pyproj
+
     try:
         system = pyproj.CRS.from_wkt(text)
         pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
@@ -182,6 +186,8 @@ def _coordinate_system(path: Path, text: str) -> pyproj.CRS:
 
 def _read_grid(path: Path) -> _Read:
     """An ESRI ASCII grid: six lines of a word and a number, then rows from north to south."""
+    import pyproj
+
     text = read_text(path, _MOST_TEXT)
     head: dict[str, float] = {}
     while (line := text.split("\n", 1))[0].split()[:1] and line[0].split()[0].lower() in _GRID_KEYS:

@@ -23,10 +23,10 @@ from kcal.errors import InputError
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import anchor, enu_to_geodetic, latitude_longitude
 from kcal.locate.localizer import Localizer
-from kcal.locate.stereo import PositionStatus
+from kcal.locate.stereo import PositionStatus, covariance_root
 from kcal.locate.survey import read_survey
 from kcal.locate.tables import NUMBERS, PositionColumns
-from kcal.locate.tabulate import Viewpoint, covariance_root
+from kcal.locate.tabulate import Viewpoint
 from kcal.texts import brief
 
 # Why there are neither maps nor latitudes, and the cure.

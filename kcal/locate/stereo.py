@@ -349,3 +349,9 @@ class Sensitivity(NamedTuple):
 
     meters_per_pixel: Tensor
     meters_per_degree: Tensor
+
+
+def covariance_root(matrix: Tensor) -> Tensor:
+    """(..., P, P) root with root rootᵀ = matrix, negative eigenvalues by rounding taken as zero."""
+    values, vectors = torch.linalg.eigh(matrix)
+    return vectors * values.clamp_min(0.0).sqrt()[..., None, :]

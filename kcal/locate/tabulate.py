@@ -22,7 +22,7 @@ from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import azimuth_elevation
-from kcal.locate.stereo import Localization, PositionStatus
+from kcal.locate.stereo import Localization, PositionStatus, covariance_root
 from kcal.locate.tables import NUMBERS
 
 # What depends on grids and map projections: height above the sea, and grid north. Through PROJ, outside any graph.
@@ -329,12 +329,6 @@ def _sampled(enu: Tensor, covariance: Tensor, shares: tuple[float, ...]) -> Tens
     distance = torch.linalg.vector_norm((points - enu[:, None, :])[..., :2], dim=-1)
     ordered = torch.where(ahead, distance, torch.inf).sort(-1).values
     return ordered[:, [min(_DRAWS - 1, round(share * _DRAWS)) for share in shares]]
-
-
-def covariance_root(matrix: Tensor) -> Tensor:
-    """(..., P, P) root with root rootᵀ = matrix, negative eigenvalues by rounding taken as zero."""
-    values, vectors = torch.linalg.eigh(matrix)
-    return vectors * values.clamp_min(0.0).sqrt()[..., None, :]
 
 
 @functools.lru_cache(maxsize=2)

@@ -60,7 +60,7 @@ def field_border(camera: Camera) -> tuple[Tensor, Tensor]:
     Example:
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
         >>> rays, whole = field_border(camera)
-        >>> (rays[0] / rays[0, 2]).tolist(), bool(whole.all())
+        >>> (rays[0] / rays[0, 2]).round(decimals=4).tolist(), bool(whole.all())
         ([-0.6, -0.3375, 1.0], True)
     """
     width, height = camera.size

@@ -19,7 +19,6 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import Views, poses_under, refine_poses
 from kcal.calibrate.rig.sources import Boards, RigData
 from kcal.corners.board import Board
-from kcal.corners.images import expand_images
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
@@ -83,6 +82,8 @@ def image_pairs(left: Sequence[str | Path], right: Sequence[str | Path]) -> list
         FileError: nothing there.
         InputError: names that cannot be paired.
     """
+    from kcal.corners.images import expand_images  # which loads OpenCV
+
     first, second = ({path.name: path for path in expand_images(given)} for given in (left, right))
     if len(first) == len(second) == 1:
         return [*zip(first.values(), second.values(), strict=True)]
