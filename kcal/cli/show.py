@@ -173,7 +173,7 @@ def view_command(
         elif kind == "observations":
             scene.append(kcal.Observations.load(file))
         else:
-            scene.append(_of_table(file, localize, note))
+            scene.append(_of_table(file, kind, localize, note))
     kcal.report.save_view(output, localize, *scene, reach=reach)
     print_wrote(output)
     if open_:
@@ -195,7 +195,7 @@ def _rig_of(source: str) -> kcal.Rig:
     return kcal.Rig([camera], [name or path.name.split(".")[0]], torch.eye(3)[None], torch.zeros(1, 3))
 
 
-def _of_table(file: Path, localize: kcal.Localizer, note: str) -> Located | Survey:
+def _of_table(file: Path, kind: str, localize: kcal.Localizer, note: str) -> Located | Survey:
     """Positions as they were written, marks or a detector's lines as they are located now, or landmarks."""
     import torch
 
@@ -208,14 +208,14 @@ def _of_table(file: Path, localize: kcal.Localizer, note: str) -> Located | Surv
     from kcal.pipeline.grouping import marks_of_lines
 
     locate = PointLocator(localize)
-    kind = "lines" if file_kind(file) in ("foreign", "json") else file_kind(file)
-    if kind != "lines" and "status" in header_of(file):
+    lines = kind in ("foreign", "json")
+    if not lines and "status" in header_of(file):
         located = read_positions(file, locate)
     elif kind == "survey":
         return read_survey(file, localize.origin, measured=False)
     else:
         names, single = localize.rig.names, localize.weights == "all"
-        if kind == "lines":
+        if lines:
             chunks: Iterable[Marks] = [marks_of_lines(file, localize)]
         else:
             single = single or is_long(file)

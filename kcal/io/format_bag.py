@@ -22,6 +22,8 @@ from kcal.io.format_opencv import ros_camera, ros_values
 from kcal.lens.camera import Camera
 from kcal.lens.pose import Pose
 
+# Which bag a file will be: of ROS 1, or of ROS 2.
+SUFFIXES = (".bag", ".mcap", ".db3")
 _INFO = "sensor_msgs/msg/CameraInfo"
 # Of a message, by lowercase names: ROS 1 has D, K, R, P; and what a file calls them.
 _NAMES = {
@@ -111,7 +113,7 @@ def write_bag(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> l
     Raises:
         InputError: another suffix, or rosbags is not installed.
     """
-    if path.suffix.lower() not in (".bag", ".mcap", ".db3"):
+    if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: the suffix says which bag it will be: .bag (ROS 1), .mcap or .db3 (ROS 2)")
     from scipy.spatial.transform import Rotation
 

@@ -102,7 +102,7 @@ FORMATS = {
     ),
     "bag": CameraFormat(
         title="ROS bag with camera_info and tf",
-        suffixes=(".bag", ".mcap", ".db3"),
+        suffixes=format_bag.SUFFIXES,
         models=("pinhole", "opencv4", "opencv5", "opencv8", "fisheye4"),
         read=format_bag.read_bag,
         write=format_bag.write_bag,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.files import read_text
+from kcal.files import read_bytes
 from kcal.lens.rig import Rig
 from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks
@@ -425,7 +425,7 @@ def marks_of_lines(path: Path, localize: Localizer) -> Marks:
     paired = rig if rig.is_pair and rig.names == ("left", "right") else localize
     noise = float(localize.pixel_sigma)
     seen = []
-    for number, line in enumerate(read_text(path, 2**30).splitlines(), 1):
+    for number, line in enumerate(read_bytes(path).splitlines(), 1):
         if line.strip():
             try:
                 seen.append(read_moment(line, paired, AssociationOptions(), noise).pairs)

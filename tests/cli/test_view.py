@@ -61,13 +61,14 @@ def test_marks_and_the_positions_of_them_are_one_scene(command: Command) -> None
 
 
 def test_lines_of_a_detector_are_located_at_their_times(command: Command) -> None:
-    """The last one too, that has no end of line, as marks with the same noise."""
+    """As marks with the same noise: the last one too, that has no end of line, and a category with a line separator."""
     rows = [row.split(",") for row in Path("points.csv").read_text().splitlines()[1:]]
     lines = [
-        f'{{"time": {time}, "left": [[{", ".join(numbers[:2])}]], "right": [[{", ".join(numbers[2:])}]], "sigma": 0.3}}'
+        f'{{"time": {time}, "categories": ["a\u2028b"], "sigma": 0.3, '
+        f'"left": [[{", ".join(numbers[:2])}]], "right": [[{", ".join(numbers[2:])}]]}}'
         for _, *numbers, time in rows
     ]
-    Path("lines.jsonl").write_text("\n\n".join(lines))
+    Path("lines.jsonl").write_text("\n\n".join(lines), encoding="utf-8")
     assert "lines.jsonl: 3 rows: 3 ok" in command("view rig.json lines.jsonl --pixel-sigma 0.3 -o lines.rrd").out
     command("view rig.json points.csv --pixel-sigma 0.3 -o marks.rrd")
     assert np.abs(np.array(centers("lines.rrd")) - np.array(centers("marks.rrd"))).max() < 1e-3
