@@ -17,7 +17,7 @@ from kcal.calibrate.rig.problem import goodness_of_fit
 from kcal.calibrate.rig.result import records
 from kcal.calibrate.rig.source import Start, typical_ratio
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import SharedCovariance, relative_rows, slot_rows
+from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.calibrate.rig.unknowns import held
 from kcal.checks import as_points, beyond_chance, chi2_quantile, variance_factor
 from kcal.errors import DegenerateError, InputError
@@ -523,15 +523,15 @@ def _against(
     problem, _ = work.solve(mask, _SOLVER)
     state = work.part(mask)
     fit = goodness_of_fit(problem, state)
-    known = SharedCovariance(problem, state, fit.variance)
-    covariance, determined = known.of(relative_rows(problem, state, 0, 1))
+    known = RigSolution(problem, state, fit.variance)
+    covariance, determined = known.of(known.relative_rows(0, 1))
     if not bool(determined[:3].all()):
         left_open = "; ".join(known.open_directions(_NAMES, absolute=True))
         raise DegenerateError(f"drift: what was seen does not determine how the cameras have turned ({left_open})")
     relative = state.rotation[1] @ state.rotation[0].T
     drift = vector_from_rotation(relative @ rig.right_from_left_rotation.T)
     own = [vector_from_rotation(now @ then.T) for now, then in zip(state.rotation, start.rotation, strict=True)]
-    alone = [known.of(slot_rows(problem, problem.turn[c]))[0] for c in (0, 1)]
+    alone = [known.of(known.turn_rows(c))[0] for c in (0, 1)]
     compared = covariance[:3, :3]
     if before is not None:
         compared = compared + before[0]

@@ -13,7 +13,6 @@ import argparse
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
 from unittest import mock
 
 import torch
@@ -21,9 +20,11 @@ from torch import Tensor
 
 from kcal import Baseline, Board, Camera, Features, Localizer, Observations, Rig, RigData, View, solve_rig
 from kcal.calibrate.rig import assess
-from kcal.calibrate.rig.adjustment import widen_for_parts
+from kcal.calibrate.rig.adjustment import Adjustment
+from kcal.calibrate.rig.contradictions import widen_for_parts
 from kcal.calibrate.rig.pairs import paired_boards
 from kcal.calibrate.rig.result import RigResult
+from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.finding import Finding
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.rig import RigCovariance
@@ -107,9 +108,9 @@ def judged(kind: str, draws: int) -> list[str]:
     ways: list[list[tuple[float, float, bool]]] = [[], []]
     told, before = 0, list[Tensor]()
 
-    def kept(*given: Any) -> list[Finding]:
-        before.append(given[4].root)
-        return widen_for_parts(*given)
+    def kept(work: Adjustment, mask: Tensor, solution: RigSolution) -> list[Finding]:
+        before.append(solution.root)
+        return widen_for_parts(work, mask, solution)
 
     for seed in range(draws):
         given = make(kind, 90_000 + seed)
@@ -117,7 +118,7 @@ def judged(kind: str, draws: int) -> list[str]:
             found = solve_rig(given, dataclasses.replace(STRAIGHT, reject=False))
         told += any("disagree with the other" in text for text in found.warnings)
         ways[1].append(judged_rig(found, truth))
-        found._covariance.root = before[-1]
+        found._solution.root = before[-1]
         ways[0].append(judged_rig(found, truth))
     wider = sum(new[1] / old[1] for old, new in zip(*ways, strict=True)) / draws
     cells = [kind, str(draws), f"{100 * told / draws:.0f} %", f"{wider:.2f}"]

@@ -17,7 +17,6 @@ import torch
 
 from kcal import Baseline, Features, InputError, RigData, solve_rig
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.uncertainty import slot_rows
 from kcal.lens import vector_from_rotation
 from scripts.check.rig import (
     BASELINE,
@@ -63,7 +62,7 @@ def data(times: float, tape: float, seed: int) -> RigData:
 def errors(found: RigResult) -> torch.Tensor:
     """(3,) errors of the left camera's attitude on the Earth in standard deviations."""
     error = vector_from_rotation(found.rotation[0] @ ROTATION[0].T)
-    return error / found._covariance.variances(slot_rows(found._problem, found._problem.turn[0])).sqrt()
+    return error / found._solution.variances(found._solution.turn_rows(0)).sqrt()
 
 
 @torch.no_grad()

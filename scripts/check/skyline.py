@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from kcal import Camera, KcalError, MeasuredPosition, Origin, RigData, calibrate_camera, solve_rig
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.uncertainty import SharedCovariance
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from kcal.rig import RasterError, SkylineImage, skyline_attitude, skyline_source
@@ -129,7 +128,7 @@ def _calibrated(number: int) -> Camera:
 
 def _pointing(result: RigResult, c: int, site: Site) -> tuple[torch.Tensor, Floats]:
     """(6, S) and (6,) px: where a camera sees the true directions of three pixels, across and down, less these."""
-    problem, state = result._problem, result._state
+    problem, state = result._solution.problem, result._solution.state
     posed = problem.posed(state)[c]
     width, height = posed.camera.size
     pixels = torch.tensor([[share * width, 0.45 * height] for share in (0.15, 0.5, 0.85)]).double()
@@ -146,7 +145,7 @@ def _pointing(result: RigResult, c: int, site: Site) -> tuple[torch.Tensor, Floa
 
 
 def _sigmas(result: RigResult, rows: torch.Tensor) -> Floats:
-    found: Floats = SharedCovariance(result._problem, result._state, result.variance).variances(rows).sqrt().numpy()
+    found: Floats = result._solution.variances(rows).sqrt().numpy()
     return found
 
 

@@ -173,7 +173,7 @@ def graded(seed: int) -> tuple[Rig, Landmarks, dict[str, Any]]:
     except KcalError:
         # A row without any spread.
         return truth, exact, head | {"count": 0}
-    place = assess.open_place(there._problem, there._state, there._covariance, 0, 1)
+    place = assess.open_place(there._solution, 0, 1)
     assert place is not None
     scale = Draw(FIRST + seed).log_uniform(0.02, 0.5) / place.share
     if scale * exact.pixel_sigma > MOST_NOISE:
@@ -208,12 +208,11 @@ def one(kind: str, seed: int) -> dict[str, Any]:
 
 def checked(truth: Rig, found: RigResult, draw: Draw) -> dict[str, Any]:
     """What `solve_rig` makes of a result that was not checked."""
-    solved = found._problem, found._state, found._covariance
-    place = assess.open_place(*solved, 0, 1)
+    place = assess.open_place(found._solution, 0, 1)
     assert place is not None
     record: dict[str, Any] = {"share": place.share, "ratio": place.ratio, "found": float(found.stereo().baseline)}
     try:
-        widen, said = assess.check_places(*solved, found.names)
+        widen, said = assess.check_places(found._solution, found.names)
     except KcalError as error:
         return record | {"outcome": "refused", "said": str(error)}
     outcome = "warned" if said else "accepted"

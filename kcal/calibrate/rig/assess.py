@@ -12,20 +12,16 @@ import torch
 from torch import Tensor
 
 import kcal.calibrate.rig.explanations as explanations
-from kcal.calibrate.rig.adjustment import Adjustment, widen_for_parts
+from kcal.calibrate.rig.adjustment import Adjustment
+from kcal.calibrate.rig.contradictions import contradicting_source, sigmas_findings, widen_for_parts
 from kcal.calibrate.rig.initial_poses import InitialPoses
-from kcal.calibrate.rig.marks import FeatureBlock
+from kcal.calibrate.rig.marks import Features
 from kcal.calibrate.rig.motion import moved_findings, scatter_findings
 from kcal.calibrate.rig.problem import RigProblem, goodness_of_fit
 from kcal.calibrate.rig.resection import distinct_poses
 from kcal.calibrate.rig.result import Reasons, RigResult, places, records
-from kcal.calibrate.rig.source import RigState, as_items
-from kcal.calibrate.rig.uncertainty import (
-    SharedCovariance,
-    mounting_rows,
-    parameter_rows,
-    relative_rows,
-)
+from kcal.calibrate.rig.source import Context, RigState, as_items
+from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding
 from kcal.io.camera_file import provenance
@@ -61,34 +57,30 @@ _DIRECTIONS = torch.nn.functional.normalize(
 )
 
 
-def check_places(
-    problem: RigProblem, state: RigState, covariance: SharedCovariance, names: Sequence[str], *, refuse: bool = True
-) -> tuple[float, list[Finding]]:
+def check_places(solution: RigSolution, names: Sequence[str], *, refuse: bool = True) -> tuple[float, list[Finding]]:
     """By how much the standard deviations of a rig must be multiplied for its intervals to be right, and doubts.
 
     Args:
-        problem: the problem.
-        state: its solution.
-        covariance: of the solution.
+        solution: the rig.
         names: of the cameras.
         refuse: raise an error where no range is known; otherwise a doubt tells.
 
     Raises:
         DegenerateError: a camera whose place is so open that no range is known; what to add is told.
     """
-    widen, doubts = 1.0, list[Finding]()
+    widen, doubts, center = 1.0, list[Finding](), solution.state.center
     for second in range(1, len(names)):
-        found = open_place(problem, state, covariance, 0, second)
+        found = open_place(solution, 0, second)
         if found is None or (found.ratio <= _LINEAR and found.share <= _OPEN):
             continue
         hopeless = not (found.ratio <= _HOPELESS and found.share <= _OPEN)
-        baseline = float((state.center[second] - state.center[0]).norm())
+        baseline = float((center[second] - center[0]).norm())
         word = ("sideways", "up and down", "along its view")[int(found.direction.abs().argmax())]
         text = (
             f"the data {'do not' if hopeless else 'hardly'} determine where {names[second]} stands: "
             f"± {found.sigma:.2g} m ({word} as {names[0]} sees it) with a baseline of {baseline:.3g} m; "
         )
-        advice = _advice(problem, state)
+        advice = _advice(solution.problem, solution.state)
         if hopeless and refuse:
             raise DegenerateError(f"{text}ranges could be anything. {advice}")
         factor = min(max(found.ratio, 1.0) ** 2, _WIDEST)
@@ -105,15 +97,11 @@ def check_places(
 _MOST_BENT, _DIRECTIONS_TRIED = 1.0, 2
 
 
-def check_poses(
-    problem: RigProblem, state: RigState, covariance: SharedCovariance, names: Sequence[str], *, refuse: bool = True
-) -> list[Finding]:
+def check_poses(solution: RigSolution, names: Sequence[str], *, refuse: bool = True) -> list[Finding]:
     """Widen the covariance where landmarks leave a camera's pose so open that it is not linear; return doubts.
 
     Args:
-        problem: the problem.
-        state: its solution.
-        covariance: of the solution; its root grows.
+        solution: the rig; its root grows.
         names: of the cameras.
         refuse: raise an error where the pose could be anything; otherwise a doubt tells.
 
@@ -121,20 +109,21 @@ def check_poses(
         DegenerateError: a camera whose pose is so open; what to add is told.
     """
     doubts, missing = list[Finding](), list[Tensor]()
+    problem, state = solution.problem, solution.state
     points = _surveyed(problem, state)
-    if points is None or not covariance.complete:
+    if points is None or not solution.complete:
         return doubts
     still, at_rest = problem.linearize(state).step(_UNDAMPED)[0]
     for c, name in enumerate(names):
-        pose = mounting_rows(problem, state, c)[:6]
-        half = covariance.half_of(pose)
+        pose = solution.mounting_rows(c)[:6]
+        half = solution.half_of(pose)
         if half is None or not bool(half.any()):
             continue
         distance = float((points - state.center[c]).norm(dim=-1).median())
         ways = torch.linalg.svd(half / half.new_tensor([distance] * 3 + [1.0] * 3), full_matrices=False).U
         sigma, bent = half.square().sum(0).sqrt(), 0.0
         for way in ways.T[:_DIRECTIONS_TRIED]:
-            step = _SIGMAS * covariance.root @ way
+            step = _SIGMAS * solution.root @ way
             ends = []
             for moved in (step, -step):
                 there = problem.retract(state, (moved, torch.zeros_like(at_rest)))
@@ -151,7 +140,7 @@ def check_poses(
                 raise DegenerateError(doubt.sentence)
             doubts.append(doubt)
     if missing and not doubts:
-        covariance.root = torch.cat([covariance.root, torch.stack(missing, 1)], 1)
+        solution.root = torch.cat([solution.root, torch.stack(missing, 1)], 1)
     return doubts
 
 
@@ -229,15 +218,14 @@ class _Targets(NamedTuple):
         return sum((weight * node for weight, node in zip(weights, self.half, strict=True)), torch.zeros(()))
 
 
-def open_place(
-    problem: RigProblem, state: RigState, covariance: SharedCovariance, first: int, second: int
-) -> OpenPlace | None:
+def open_place(solution: RigSolution, first: int, second: int) -> OpenPlace | None:
     """Tell how open the place of the second camera is; None where the data do not determine all of the rig."""
+    problem, state = solution.problem, solution.state
     rotation = state.rotation[second] @ state.rotation[first].T
     center = state.rotation[first] @ (state.center[second] - state.center[first])
-    half = covariance.half_of(relative_rows(problem, state, first, second))
+    half = solution.half_of(solution.relative_rows(first, second))
     inverse = 1.0 / (torch.tensor(_DISTANCES, dtype=torch.float64) * center.norm())
-    targets = _targets(problem, state, covariance, (first, second), float(inverse[0]))
+    targets = _targets(solution, first, second, float(inverse[0]))
     if half is None or targets is None:
         return None
     turns, moves = half[:, :3], half[:, 3:]
@@ -287,11 +275,10 @@ def _first_order(rays: Tensor, true: Tensor, center: Tensor, moved: Tensor) -> T
     return (2.0 * found * p * dp - dp * q - p * dq) / square
 
 
-def _targets(
-    problem: RigProblem, state: RigState, covariance: SharedCovariance, pair: tuple[int, int], near: float
-) -> _Targets | None:
+def _targets(solution: RigSolution, first: int, second: int, near: float) -> _Targets | None:
     """Targets all over the first camera's image."""
-    camera, first = problem.cameras[pair[0]], pair[0]
+    problem, state = solution.problem, solution.state
+    camera = problem.cameras[first]
     across, down = (
         (torch.arange(count).double() + 0.5) * size / count - 0.5
         for count, size in zip((_COLUMNS, _ROWS), camera.size, strict=True)
@@ -301,10 +288,16 @@ def _targets(
     direction, count = (rays @ state.rotation[first]).repeat(3, 1), 3 * len(rays)
     inverse = torch.tensor([0.0, 0.5 * near, near], dtype=torch.float64).repeat_interleave(len(rays))
     pixels = torch.full((count, len(problem.cameras), 2), torch.nan, dtype=torch.float64)
-    pixels[:, list(pair)] = 0.0
-    nothing = torch.zeros(count, dtype=torch.float64), torch.full((count,), torch.inf, dtype=torch.float64)
-    whitening = (torch.eye(2, dtype=torch.float64) / _MARK).expand(*pixels.shape, 2)
-    block = FeatureBlock(pixels, whitening, *nothing, state.center[first])
+    pixels[:, [first, second]] = 0.0
+    anywhere = Features(
+        names=tuple(map(str, range(count))),
+        pixels=pixels,
+        inverse_range=torch.zeros(count, dtype=torch.float64),
+        inverse_range_sigma=torch.full((count,), torch.inf, dtype=torch.float64),
+        pixel_sigma=_MARK,
+    )
+    given = Context(problem.cameras, state, problem.unknowns, state.center[first])
+    block = anywhere.block(torch.ones(count, dtype=torch.bool), given)
     turning, moving = ([slot is not None for slot in slots] for slots in (problem.turn, problem.shift))
     alone = RigProblem(problem.cameras, [block], (), problem.unknowns, turning, moving)
     follow, own = alone.response(state._replace(items=as_items(direction, inverse[:, None])), block)
@@ -313,7 +306,7 @@ def _targets(
     if slot is not None:
         # The range is from where the first camera stands, not from where it was found.
         rows[:, slot] += inverse.square()[:, None] * direction
-    half = covariance.half_of(rows)
+    half = solution.half_of(rows)
     if half is None or not len(rays):
         return None
     own = own.unflatten(0, (3, -1))[0, :, -1, -1]
@@ -486,10 +479,10 @@ def rig_result(
     """
     data, state, problem = work.data, work.part(mask), work.problem(mask)
     fit = goodness_of_fit(problem, state)
-    covariance = SharedCovariance(problem, state, fit.variance)
-    undetermined = covariance.open_directions(data.names, absolute=data.absolute)
+    solution = RigSolution(problem, state, fit.variance)
+    undetermined = solution.open_directions(data.names, absolute=data.absolute)
     for second in range(1, len(data.cameras)):
-        if not bool(covariance.of(relative_rows(problem, state, 0, second))[1].all()):
+        if not bool(solution.of(solution.relative_rows(0, second))[1].all()):
             what = "; ".join(undetermined[:3]) + (" and more" if len(undetermined) > 3 else "")
             cure = (
                 "add boards seen by both, surveyed landmarks, far features of known range, a measured baseline or "
@@ -505,35 +498,23 @@ def rig_result(
                 f"anything; {cure}"
             )
     explanations.refuse_exact(problem, data.names, fit.freedom)
-    explanations.refuse_one_place(data, problem, state, covariance)
-    widen, doubts = check_places(problem, state, covariance, data.names, refuse=refuse)
+    explanations.refuse_one_place(data, solution)
+    widen, doubts = check_places(solution, data.names, refuse=refuse)
     if widen > 1.0:
-        covariance = SharedCovariance(problem, state, widen**2 * fit.variance)
-    apart = widen_for_parts(work, mask, problem, state, covariance, widen**2 * fit.variance)
-    more = check_poses(problem, state, covariance, data.names, refuse=refuse)
+        solution = RigSolution(problem, state, widen**2 * fit.variance)
+    apart = widen_for_parts(work, mask, solution)
+    more = check_poses(solution, data.names, refuse=refuse)
     doubts += [] if doubts else more
     refuse_several(work, mask)
-    against = explanations.contradiction(work, problem, state)
-    certain = against is not None and against.sigmas > explanations.CERTAIN
-    if against is not None and certain and refuse and against.stated:
-        raise InputError(against.text)
+    against = contradicting_source(work, solution, refuse=refuse)
     told = records(work, mask, reasons)
     rms = math.sqrt(float(told.squared.sum() / told.counts.sum()))
     status = SolverStatus(int(found.status))
+    findings += [*sigmas_findings(work, fit), *apart, *against]
 
     def doubt(name: str, text: str, action: str = "") -> None:
         findings.append(Finding(name, "doubt", text, action))
 
-    for kind, times in work.widened.items():
-        if times > 1.0:
-            text = f"the {kind} differ from each other by {times:.1f} times what their sigmas say"
-            doubt("sigmas", f"{text}: their sigmas were multiplied by {times:.1f}")
-    if fit.variance > 1.0:
-        times = math.sqrt(fit.variance)
-        doubt("sigmas", f"residuals are {times:.1f} times as large as their sigmas say; the covariance was widened")
-    findings += apart
-    if against is not None:
-        findings.append(Finding("contradiction", "stop" if certain else "doubt", against.text))
     only_boards = len(problem.blocks) == 1 and problem.blocks[0].many
     if only_boards and (count := int(mask.sum())) < _FEW_BOARDS:
         doubt("pairs", f"{counted_text(count, 'pair')} only: a wrong one could not be noticed", "5 or more are good")
@@ -554,19 +535,19 @@ def rig_result(
     findings += doubts
     for text in undetermined:
         doubt("place", f"not determined by the data: {text}")
-    whole = [parameter_rows(problem, c) for c in range(len(data.cameras))]
-    if not bool(covariance.of(torch.cat(whole))[1].all()):
+    lenses = [solution.parameter_rows(c) for c in range(len(data.cameras))]
+    if not bool(solution.of(torch.cat(lenses))[1].all()):
         doubt(
             "place",
             "the data do not determine all parameters of the cameras: the rig has no covariance, and intervals know "
             "errors of the marks alone",
         )
-    findings += explanations.swap_findings(data, problem, state, covariance)
+    findings += explanations.swap_findings(data, solution)
     cameras = data.cameras
     if any(bool(part.any()) for part in problem.unknowns.cameras):
         cameras = tuple(
-            _refined(camera, problem.parameters(state)[c], covariance.of(parameter_rows(problem, c))[0])
-            for c, camera in enumerate(data.cameras)
+            _refined(camera, parameters, solution.of(rows)[0])
+            for camera, parameters, rows in zip(data.cameras, problem.parameters(state), lenses, strict=True)
         )
     return RigResult(
         data=data,
@@ -581,14 +562,12 @@ def rig_result(
         rms_px=tuple((told.squared / told.counts).sqrt().tolist()),
         chi2=fit.chi2,
         freedom=fit.freedom,
-        variance=widen**2 * fit.variance,
+        variance=solution.variance,
         sigma_corner=None if data.boards is None else work.sigma_corner,
         undetermined=undetermined,
         status=status,
         findings=tuple(findings),
-        _problem=problem,
-        _state=state,
-        _covariance=covariance,
+        _solution=solution,
         _places=places(work),
         _provenance=provenance(),
     )

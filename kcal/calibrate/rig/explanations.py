@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import LOSS, MOST_WRONG, ROUGHLY, Adjustment, without_wrong
+from kcal.calibrate.rig.contradictions import parts_of
 from kcal.calibrate.rig.marks import FeatureBlock
 from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, goodness_of_fit, least
 from kcal.calibrate.rig.resection import consensus_pose
 from kcal.calibrate.rig.source import RigState
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import SharedCovariance, relative_rows
-from kcal.checks import variance_factor
+from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding
 from kcal.solve.lm import LMOptions
@@ -58,13 +58,14 @@ def refuse_same_camera(data: RigData) -> None:
                 )
 
 
-def refuse_one_place(data: RigData, problem: RigProblem, state: RigState, covariance: SharedCovariance) -> None:
+def refuse_one_place(data: RigData, solution: RigSolution) -> None:
     """Raise `InputError` if one camera was given at two places, and its images come from one and the same."""
+    state = solution.state
     for second, lens in enumerate(data.lenses):
         for first in (c for c in range(second) if data.lenses[c] == lens):
-            rows = relative_rows(problem, state, first, second)[3:]
+            rows = solution.relative_rows(first, second)[3:]
             shift = state.rotation[second] @ (state.center[first] - state.center[second])
-            known, determined = covariance.of(rows)
+            known, determined = solution.of(rows)
             if bool(determined.all()) and float(shift @ torch.linalg.pinv(known) @ shift) < _AT_ONE_PLACE:
                 apart, sigma = float(shift.norm()), float(known.diagonal().sum().sqrt())
                 raise InputError(
@@ -92,16 +93,14 @@ def one_camera_doubts(data: RigData) -> list[Finding]:
     ]
 
 
-def swap_findings(data: RigData, problem: RigProblem, state: RigState, covariance: SharedCovariance) -> list[Finding]:
+def swap_findings(data: RigData, solution: RigSolution) -> list[Finding]:
     """Tell if left and right are swapped: by the side on which the right camera is, and by features behind both.
 
     Args:
         data: only cameras named `left` and `right` have sides.
-        problem: the problem.
-        state: its solution.
-        covariance: of the solution.
+        solution: of these.
     """
-    found = []
+    found, state = [], solution.state
     if {"left", "right"} <= set(data.names):
         left, right = data.names.index("left"), data.names.index("right")
         shift = state.center[right] - state.center[left]
@@ -113,7 +112,7 @@ def swap_findings(data: RigData, problem: RigProblem, state: RigState, covarianc
             text = f"the right camera is {-side:.3g} m to the left of the left camera: left and right are swapped"
             action = "exchange their cameras, observations and marks"
             found.append(Finding("swapped", "doubt", f"{text}{otherwise}", action))
-    behind, seen = _features_behind(problem, state, covariance)
+    behind, seen = _features_behind(solution)
     if behind > seen / 2:
         text = (
             f"{behind} of {seen} features have negative parallax, as if they were behind the cameras: left and right "
@@ -148,13 +147,14 @@ def _rightward(data: RigData, state: RigState, left: int, right: int) -> Tensor:
     return across / torch.linalg.vector_norm(across)
 
 
-def _features_behind(problem: RigProblem, state: RigState, covariance: SharedCovariance) -> tuple[int, int]:
+def _features_behind(solution: RigSolution) -> tuple[int, int]:
     """How many features have an inverse range that is negative beyond chance, and how many there are."""
+    problem, state = solution.problem, solution.state
     for block, own in problem.parts(state):
         if isinstance(block, FeatureBlock):
             # The last local unknown is the inverse range; what the cameras' errors make of it is added.
             follow, alone = (value[:, -1] for value in problem.response(state, block))
-            variance = covariance.variances(follow) + alone[:, -1]
+            variance = solution.variances(follow) + alone[:, -1]
             return int((own.items[:, 3] < -_BEHIND_SIGMAS * variance.sqrt()).sum()), len(block)
     return 0, 0
 
@@ -204,160 +204,6 @@ def refuse_exact(problem: RigProblem, names: Sequence[str], freedom: int) -> Non
         "check it with, and a wrong measurement, or another place that fits as well, could not be noticed. Mark at "
         "least one more surveyed landmark in both images (six or more are good), or add boards or features seen by "
         "both, a measured baseline or measured positions"
-    )
-
-
-# Test each source of a rig against all the others, and name the one that contradicts.
-#
-# A source that is stated too precisely bends the solution towards itself, and its error shows as slightly larger
-# residuals of everything. So it is compared with what the others say without it: the least χ² of all together exceeds
-# the sum of the least χ² of the source alone and of the others alone by χ² with as many degrees of freedom as both
-# determine. All three follow from the normal matrices of the sources at the solution, without solving again.
-
-# Standard deviations of a normal variable as unlikely as what is found: a doubt, and beyond reasonable doubt.
-_DOUBT, CERTAIN = 3.5, 4.5
-
-
-class Contradiction(NamedTuple):
-    """A source that contradicts the others.
-
-    Attributes:
-        text: one sentence with numbers.
-        sigmas: standard deviations of a normal variable that is as unlikely.
-        stated: whether it is a measured baseline or position, which nothing but itself supports.
-    """
-
-    text: str
-    sigmas: float
-    stated: bool
-
-
-class _Part(NamedTuple):
-    """A source, or a single baseline or position.
-
-    Attributes:
-        name: of it.
-        gram: (S + 1, S + 1) products of its rows, residuals last.
-        rows: how many residuals it has beyond its items' own unknowns.
-        term: its index among the problem's terms; None for boards, landmarks and features.
-    """
-
-    name: str
-    gram: Tensor
-    rows: int
-    term: int | None
-
-
-class _Test(NamedTuple):
-    """One source against the others: χ² of their difference, its freedom, and how unlikely it is."""
-
-    chi2: float
-    freedom: int
-    sigmas: float
-
-
-def contradiction(work: Adjustment, problem: RigProblem, state: RigState) -> Contradiction | None:
-    """The source that contradicts the others, or both of two that contradict each other; None where all agree."""
-    prior = problem.prior_rows(state)
-    known = _Part("", prior @ prior.T, prior.shape[1], None)
-    parts = _parts(work, problem, state)
-    groups: list[tuple[int, ...]] = [(i,) for i in range(len(parts))]
-    placed = tuple(i for i, part in enumerate(parts) if part.name.startswith("the position"))
-    if len(placed) > 1:
-        groups.append(placed)
-    everything = tuple(range(len(parts)))
-    tests = {group: _test(parts, group, everything, known) for group in groups if len(group) < len(parts)}
-    found = {group: test for group, test in tests.items() if test.sigmas > _DOUBT}
-    if not found:
-        return None
-
-    def quarrel(within: tuple[int, ...]) -> bool:
-        """Whether some parts contradict each other."""
-        return len(within) > 1 and any(_test(parts, (i,), within, known).sigmas > _DOUBT for i in within)
-
-    suspects = [group for group in found if not quarrel(tuple(i for i in everything if i not in group))]
-    own = {group: sum(parts[i].rows for i in group) - least(_sum(parts, group)).rank for group in found}
-    suspects = suspects or [max(found, key=lambda group: found[group].sigmas)]
-    suspects.sort(key=lambda group: (own[group], len(group), -found[group].sigmas))
-    named = suspects[0]
-    # A source that is supported no better by its own data is as likely to be the wrong one.
-    equal = [other for other in suspects[1:] if not set(other) & set(named) and (own[other] <= 0 or own[named] > 0)]
-    rest = [part.name for i, part in enumerate(parts) if i not in named]
-    text = _what_contradicts(parts, named, found[named], problem, state, known, rest)
-    if equal:
-        names = " and ".join(_name(parts, group) for group in equal)
-        text += f"; it may as well be {names} that is wrong"
-    return Contradiction(text, found[named].sigmas, own[named] <= 0)
-
-
-def _term_grams(problem: RigProblem, state: RigState) -> list[Tensor]:
-    posed = problem.posed(state)
-    return [rows @ rows.T for rows in (term.rows_at(posed, problem.shared_size) for term in problem.terms)]
-
-
-def _parts(work: Adjustment, problem: RigProblem, state: RigState) -> list[_Part]:
-    counted = [int((block.counts - block.size).sum()) for block in problem.blocks]
-    parts = [
-        _Part(f"the {block.kind}", gram, rows, None)
-        for block, gram, rows in zip(problem.blocks, problem.block_grams(state), counted, strict=True)
-    ]
-    labels = [label for i, label in enumerate(work.term_labels) if i not in work.without]
-    for number, (label, gram) in enumerate(zip(labels, _term_grams(problem, state), strict=True)):
-        parts.append(_Part(label, gram, problem.terms[number].count, number))
-    return parts
-
-
-def _sum(parts: list[_Part], chosen: tuple[int, ...] | set[int], known: _Part | None = None) -> Tensor:
-    grams = [parts[i].gram for i in chosen] + ([] if known is None else [known.gram])
-    return torch.stack(grams).sum(0)
-
-
-def _test(parts: list[_Part], group: tuple[int, ...], within: tuple[int, ...], known: _Part) -> _Test:
-    """A group of parts against the rest of `within` and what is known beforehand."""
-    rest = tuple(i for i in within if i not in group)
-    own, others = _sum(parts, group), _sum(parts, rest, known)
-    alone, without, together = least(own), least(others), least(own + others)
-    freedom = alone.rank + without.rank - together.rank
-    if freedom <= 0:
-        return _Test(0.0, 0, 0.0)
-    rows = sum(parts[i].rows for i in within) + known.rows
-    inner, left = alone.chi2 + without.chi2, rows - alone.rank - without.rank
-    # Where stated sigmas are too small throughout, a difference counts by what residuals really are.
-    chi2 = max(together.chi2 - inner, 0.0) / variance_factor(inner, left)
-    if freedom == 1:
-        return _Test(chi2, 1, math.sqrt(chi2))
-    # Wilson and Hilferty (1931).
-    spread = 2.0 / (9.0 * freedom)
-    return _Test(chi2, freedom, ((chi2 / freedom) ** (1 / 3) - 1.0 + spread) / math.sqrt(spread))
-
-
-def _name(parts: list[_Part], group: tuple[int, ...]) -> str:
-    return parts[group[0]].name if len(group) == 1 else "the measured positions"
-
-
-def _what_contradicts(
-    parts: list[_Part],
-    group: tuple[int, ...],
-    test: _Test,
-    problem: RigProblem,
-    state: RigState,
-    known: _Part,
-    rest: list[str],
-) -> str:
-    """What contradicts what, with numbers, and what to do."""
-    others = f"{', '.join(rest[:-1])} and {rest[-1]}" if len(rest) > 1 else rest[0]
-    verb = "contradicts" if parts[group[0]].term is not None and len(group) == 1 else "contradict"
-    term = parts[group[0]].term
-    apart = f"what they say of the cameras differs by {math.sqrt(test.chi2 / test.freedom):.1f} times what their"
-    how = f"{apart} sigmas explain"
-    if term is not None and len(group) == 1:
-        without = least(_sum(parts, set(range(len(parts))) - set(group), known))
-        rows = problem.terms[term].rows_at(problem.posed(state), problem.shared_size)
-        off = rows[-1] + without.step @ rows[:-1]
-        how = problem.terms[term].against(off, (rows[:-1].T @ without.root).square().sum(1).sqrt())
-    return (
-        f"{_name(parts, group)} {verb} {others}: {how} ({test.sigmas:.1f} standard deviations); measure again, correct "
-        "the value or its sigma, or leave it out"
     )
 
 
@@ -484,15 +330,14 @@ def _refuse_terms(work: Adjustment, mask: Tensor, kept: Tensor | None, robust: R
         names = tuple(_gone(work, mask & ~kept))
         ways.append(_Explanation.of(work, kept, names, len(names)))
     some = mask if kept is None else kept
-    problem, state = work.problem(some), work.part(some)
-    grams = _term_grams(problem, state)
-    whole = torch.stack([*problem.block_grams(state), *grams]).sum(0)
-    for term, gram in enumerate(grams):
+    parts = parts_of(work, work.problem(some), work.part(some))
+    whole = torch.stack([part.gram for part in parts]).sum(0)
+    for part in parts:
         # The others must determine as much without it.
-        if least(whole - gram).rank != least(whole).rank:
+        if part.term is None or least(whole - part.gram).rank != least(whole).rank:
             continue
         trial = copy.copy(work)
-        trial.state, trial.without = robust, frozenset([term])
+        trial.state, trial.without = robust, frozenset([part.term])
         # Without the measurement, the robust solution is found anew.
         trial.solve(mask, ROUGHLY, LOSS)
         try:
@@ -500,7 +345,7 @@ def _refuse_terms(work: Adjustment, mask: Tensor, kept: Tensor | None, robust: R
         except InputError:
             continue
         size = 1 + int((mask & ~others).sum())
-        ways.append(_Explanation.of(trial, others, (work.term_labels[term],), size))
+        ways.append(_Explanation.of(trial, others, (part.name,), size))
     fewest = min((way.size for way in ways), default=0)
     ways = sorted((way for way in ways if way.size == fewest), key=_excess)
     ways = [way for way in ways if _excess(way) < _excess(ways[0]) + AS_GOOD]

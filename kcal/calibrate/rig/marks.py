@@ -18,6 +18,7 @@ from kcal.calibrate.rig.source import (
     Effects,
     ItemSource,
     MarkBlock,
+    MarkSource,
     Measurement,
     PosedCamera,
     RigState,
@@ -37,7 +38,7 @@ from kcal.texts import brief
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Landmarks(ItemSource):
+class Landmarks(MarkSource):
     """Surveyed points, marked in the images.
 
     Args:
@@ -72,29 +73,10 @@ class Landmarks(ItemSource):
         require_finite("landmarks: points", as_points("landmarks: points", self.points, 3))
         if not bool((torch.isfinite(self.sigma) & (self.sigma > 0)).all()):
             raise InputError("landmarks: every sigma must be a positive number of meters; nothing is surveyed exactly")
-        if not isinstance(self.pixel_sigma, Tensor):
-            require_positive("landmarks: pixel_sigma", self.pixel_sigma)
-            return
-        if self.pixel_sigma.shape != self.pixels.shape[:2]:
-            raise InputError(f"landmarks: pixel_sigma {tuple(self.pixels.shape[:2])} is needed, one for each mark")
-        sigma = self.pixel_sigma[torch.isfinite(self.pixels).all(-1)]
-        if not bool((torch.isfinite(sigma) & (sigma > 0)).all()):
-            raise InputError("landmarks: pixel_sigma must be a positive number of pixels wherever there is a mark")
 
-    def __add__(self, other: Landmarks) -> Landmarks:
-        """Both, with a sigma for each mark; effects shift only those whose they are."""
-        return Landmarks(
-            names=self.names + other.names,
-            points=torch.cat([self.points, other.points]),
-            sigma=torch.cat([self.sigma, other.sigma]),
-            pixels=torch.cat([self.pixels, other.pixels]),
-            pixel_sigma=torch.cat([self._each(), other._each()]),
-            effects=self.effects_with(other),
-        )
-
-    def _each(self) -> Tensor:
-        """(L, C) px, the sigma of each mark."""
-        return torch.as_tensor(self.pixel_sigma, dtype=torch.float64).expand(self.pixels.shape[:2])
+    def by_mark(self) -> Landmarks:
+        """See `MarkSource.by_mark`."""
+        return dataclasses.replace(self, pixel_sigma=self.each_sigma)
 
     def enough(self, cameras: Sequence[Camera]) -> Tensor:
         """See `ItemSource.enough`."""
@@ -116,10 +98,7 @@ class Landmarks(ItemSource):
 
     def block(self, mask: Tensor, given: Context) -> Block:
         """See `ItemSource.block`."""
-        white = torch.eye(2, dtype=torch.float64) / (given.times * self._each()[mask][..., None, None])
-        surveyed = self.points[mask], given.times * self.sigma[mask]
-        effects = given.effects and given.effects.some(mask)
-        return LandmarkBlock(self.pixels[mask], white, *surveyed, given.unknowns.by_refraction, effects)
+        return LandmarkBlock(self, mask, given)
 
     def doubt(self, off: str, sigmas: float, over: float) -> str:
         """See `ItemSource.doubt`."""
@@ -147,32 +126,16 @@ _UP = 2
 
 
 class LandmarkBlock(MarkBlock):
-    """Surveyed points, whose adjusted positions (V, 3), meters, are the unknowns.
-
-    Args:
-        pixels: (V, C, 2), see `MarkBlock`.
-        whitening: (V, C, 2, 2), see `MarkBlock`.
-        points: (V, 3) meters, as surveyed; the third axis is up.
-        sigma: (V, 3) meters.
-        by_refraction: (K,) of the coefficient of refraction by the unknowns; None: it is held.
-        effects: see `MarkBlock`.
-    """
+    """Surveyed points, whose adjusted positions (V, 3), meters, are the unknowns; the third axis is up."""
 
     kind = "landmarks"
     size = 3
     surveyed: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        pixels: Tensor,
-        whitening: Tensor,
-        points: Tensor,
-        sigma: Tensor,
-        by_refraction: Tensor | None = None,
-        effects: Effects | None = None,
-    ) -> None:
-        super().__init__(pixels, whitening, effects, 3)
-        self._surveyed, self._sigma, self._by_refraction = points, sigma, by_refraction
+    def __init__(self, source: Landmarks, mask: Tensor, given: Context) -> None:
+        super().__init__(source, mask, given, 3)
+        self._surveyed, self._sigma = source.points[mask], given.times * source.sigma[mask]
+        self._by_refraction = given.unknowns.by_refraction
 
     @property
     def added(self) -> Tensor:
@@ -216,7 +179,7 @@ _LEAST_INVERSE_RANGE = 1e-5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Features(ItemSource):
+class Features(MarkSource):
     """Points matched between the images whose position nobody surveyed.
 
     A feature alone determines the epipolar geometry: relative pitch and roll. It determines relative yaw if something
@@ -254,27 +217,11 @@ class Features(ItemSource):
             raise InputError(f"features: inverse_range and its sigma ({count},) are needed")
         if not bool((torch.isfinite(self.inverse_range) & (self.inverse_range_sigma > 0)).all()):
             raise InputError("features: inverse ranges must be finite and their sigmas positive")
-        require_positive("features: pixel_sigma", self.pixel_sigma)
-        if self.covariance is not None and self.covariance.shape != (*self.pixels.shape, 2):
-            raise InputError(
-                f"features: a covariance {(*self.pixels.shape, 2)} is needed, got {tuple(self.covariance.shape)}"
-            )
 
-    def __add__(self, other: Features) -> Features:
-        """Both, with a covariance for each mark; effects shift only those whose they are."""
-        both = self._whole(), other._whole()
-        return Features(
-            names=self.names + other.names,
-            pixels=torch.cat([self.pixels, other.pixels]),
-            inverse_range=torch.cat([self.inverse_range, other.inverse_range]),
-            inverse_range_sigma=torch.cat([self.inverse_range_sigma, other.inverse_range_sigma]),
-            covariance=torch.cat(both),
-            effects=self.effects_with(other),
-        )
-
-    def _whole(self) -> Tensor:
+    def by_mark(self) -> Features:
+        """See `MarkSource.by_mark`."""
         alike = self.pixel_sigma**2 * torch.eye(2, dtype=torch.float64).expand(*self.pixels.shape, 2)
-        return alike if self.covariance is None else self.covariance
+        return self if self.covariance is not None else dataclasses.replace(self, covariance=alike)
 
     def begin(self, cameras: Sequence[Camera], start: Start) -> Tensor:
         """See `ItemSource.begin`; along the ray of the first camera that has one, at the range that is expected."""
@@ -283,16 +230,7 @@ class Features(ItemSource):
 
     def block(self, mask: Tensor, given: Context) -> Block:
         """See `ItemSource.block`."""
-        if self.covariance is None:
-            white = torch.eye(2, dtype=torch.float64) / (given.times * self.pixel_sigma)
-            white = white.expand(*self.pixels[mask].shape, 2)
-        else:
-            # Where a mark is missing, its covariance may be anything.
-            known = self.covariance[mask].nan_to_num(1.0)
-            white = torch.linalg.inv(torch.linalg.cholesky_ex(known)[0]) / given.times
-        known_range = self.inverse_range[mask], given.times * self.inverse_range_sigma[mask]
-        effects = given.effects and given.effects.some(mask)
-        return FeatureBlock(self.pixels[mask], white, *known_range, given.anchor, effects)
+        return FeatureBlock(self, mask, given)
 
     def doubt(self, off: str, sigmas: float, over: float) -> str:
         """See `ItemSource.doubt`."""
@@ -317,29 +255,17 @@ def inverse_range_beyond(meters: float) -> tuple[float, float]:
 
 
 class FeatureBlock(MarkBlock):
-    """Points of unknown position: a unit vector (V, 3) and an inverse range (V, 1), 1/m, from `anchor` each.
-
-    Args:
-        pixels: (V, C, 2), see `MarkBlock`, as `whitening` (V, C, 2, 2) and `effects`.
-        inverse_range: (V,) as known beforehand, with `sigma`.
-    """
+    """Points of unknown position: a unit vector (V, 3) and an inverse range (V, 1), 1/m, from the anchor each."""
 
     kind = "features"
     size = 3
     by_rows: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        pixels: Tensor,
-        whitening: Tensor,
-        inverse_range: Tensor,
-        sigma: Tensor,
-        anchor: Tensor,
-        effects: Effects | None = None,
-    ) -> None:
+    def __init__(self, source: Features, mask: Tensor, given: Context) -> None:
+        sigma = given.times * source.inverse_range_sigma[mask]
         weight = torch.where(torch.isfinite(sigma), 1.0 / sigma, 0.0)
-        super().__init__(pixels, whitening, effects, (weight > 0).long())
-        self._mean, self._weight, self._anchor = inverse_range, weight, anchor
+        super().__init__(source, mask, given, (weight > 0).long())
+        self._mean, self._weight, self._anchor = source.inverse_range[mask], weight, given.anchor
 
     @property
     def added(self) -> Tensor:
@@ -375,9 +301,14 @@ class FeatureBlock(MarkBlock):
 
     def moved(self, items: Tensor, step: Tensor) -> Tensor:
         """See `Block.moved`."""
-        first, second = side_axes(items[:, :3])
-        moved = items[:, :3] + step[:, :1] * first + step[:, 1:2] * second
-        return as_items(moved / torch.linalg.vector_norm(moved, dim=-1, keepdim=True), items[:, 3:4] + step[:, 2:3])
+        return as_items(_moved_across(items, step), items[:, 3:4] + step[:, 2:3])
+
+
+def _moved_across(items: Tensor, step: Tensor) -> Tensor:
+    """(V, 3) unit vectors (V, 3, ...) after steps (V, 2, ...) along both axes across them."""
+    first, second = side_axes(items[:, :3])
+    moved = items[:, :3] + step[:, :1] * first + step[:, 1:2] * second
+    return moved / torch.linalg.vector_norm(moved, dim=-1, keepdim=True)
 
 
 # Stars that several cameras of a rig saw at the same moments, as a source of a rig.
@@ -393,7 +324,7 @@ def star_turns(effects: Sequence[Effect], stars: int, cameras: int) -> Tensor:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class StarSource(ItemSource):
+class StarSource(MarkSource):
     """Stars that cameras of a rig saw at the same moments, each with its own sigma.
 
     A star is at infinity: it tells how the cameras are turned against each other, yaw included, and where it has a
@@ -426,15 +357,10 @@ class StarSource(ItemSource):
     effects: tuple[Effect, ...] = ()
 
     def __post_init__(self) -> None:
-        count, shape = len(self.names), self.pixels.shape
+        count = len(self.names)
         self.check_marks()
-        if self.pixel_sigma.shape != shape[:2]:
-            raise InputError(f"stars: pixels ({count}, C, 2) and a sigma for each are needed")
         if self.direction.shape != (count, 3) or self.direction_sigma.shape != (count,):
             raise InputError(f"stars: directions ({count}, 3) and a sigma ({count},) are needed")
-        seen = torch.isfinite(self.pixels).all(-1)
-        if not bool((self.pixel_sigma[seen] > 0).all() & torch.isfinite(self.pixel_sigma[seen]).all()):
-            raise InputError("stars: every pixel_sigma must be a positive number")
         if not bool((self.direction_sigma > 0).all()):
             raise InputError("stars: every direction_sigma must be positive; it is infinite without a name")
         require_finite("stars: directions", self.direction[self.named])
@@ -471,13 +397,13 @@ class StarSource(ItemSource):
         direction = torch.where(self.named[:, None], self.direction, seen)
         return as_items(direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True))
 
+    def by_mark(self) -> StarSource:
+        """See `MarkSource.by_mark`."""
+        return self
+
     def block(self, mask: Tensor, given: Context) -> Block:
         """See `ItemSource.block`."""
-        count, cameras = self.pixels.shape[:2]
-        white = torch.eye(2, dtype=torch.float64) / (given.times * self.pixel_sigma[mask][..., None, None])
-        known = self.direction[mask], given.times * self.direction_sigma[mask]
-        turns = star_turns(self.effects, count, cameras)[:, :, mask]
-        return StarBlock(self.pixels[mask], white, *known, turns, given.effects and given.effects.some(mask))
+        return StarBlock(self, mask, given)
 
     def doubt(self, off: str, sigmas: float, over: float) -> str:
         """See `ItemSource.doubt`."""
@@ -489,32 +415,17 @@ class StarBlock(MarkBlock):
 
     Camera c sees star i in the direction d_i + Σ_e u_e (t_eci × d_i + s_eic) with the unknowns u_e of clocks and air,
     which are standard normal beforehand.
-
-    Args:
-        pixels: (V, C, 2), see `MarkBlock`.
-        whitening: (V, C, 2, 2), see `MarkBlock`.
-        direction: (V, 3) of the catalogue; anything for stars without a name.
-        sigma: (V,) radians; infinite for these.
-        turns: (E, C, V, 3) radians, see `star_turns`.
-        effects: see `MarkBlock`; its amounts are the u_e.
     """
 
     kind = "stars"
     size = 2
 
-    def __init__(
-        self,
-        pixels: Tensor,
-        whitening: Tensor,
-        direction: Tensor,
-        sigma: Tensor,
-        turns: Tensor,
-        effects: Effects | None = None,
-    ) -> None:
-        named = torch.isfinite(sigma)
-        super().__init__(pixels, whitening, effects, 2 * named.long())
-        self._weight, self._turns = torch.where(named, 1.0 / sigma, 0.0), turns
-        self._known = torch.where(named[:, None], direction, 0.0)
+    def __init__(self, source: StarSource, mask: Tensor, given: Context) -> None:
+        sigma, named = given.times * source.direction_sigma[mask], source.named[mask]
+        super().__init__(source, mask, given, 2 * named.long())
+        self._weight = torch.where(named, 1.0 / sigma, 0.0)
+        self._turns = star_turns(source.effects, *source.pixels.shape[:2])[:, :, mask]
+        self._known = torch.where(named[:, None], source.direction[mask], 0.0)
 
     def _place(self, state: RigState) -> tuple[Tensor, Tensor]:
         return state.items[:, :3, None], state.items.new_zeros(len(self), 1, 1)
@@ -536,9 +447,7 @@ class StarBlock(MarkBlock):
 
     def moved(self, items: Tensor, step: Tensor) -> Tensor:
         """See `Block.moved`."""
-        first, second = side_axes(items[:, :3])
-        moved = items[:, :3] + step[:, :1] * first + step[:, 1:2] * second
-        return as_items(moved / torch.linalg.vector_norm(moved, dim=-1, keepdim=True))
+        return as_items(_moved_across(items, step))
 
 
 # What skylines tell of a rig: attitudes of its cameras, with the errors that they share, as one Gaussian.

@@ -310,18 +310,10 @@ class GoodnessOfFit(NamedTuple):
 
 def goodness_of_fit(problem: RigProblem, state: RigState) -> GoodnessOfFit:
     """Compare the residuals at a minimum with their sigmas."""
-    counted = sum(int((block.counts - block.size).sum()) for block in problem.blocks)
+    counted = sum(int(block.freedom.sum()) for block in problem.blocks)
     freedom = counted + problem.term_rows(state).shape[1] - problem.shared_size
     return GoodnessOfFit(2.0 * float(problem.cost(state)), freedom)
 
-
-# How well each source of a rig fits itself: what its items leave over where nothing else is known of the cameras.
-#
-# Marks by hand are often worse than their sigmas say. Beside a thousand good matches that hardly shows in the χ² of
-# all, yet the marks pull at the cameras as if they were right, and what they contradict then looks wrong. So each
-# source is asked alone, with what is known of the lenses: what the others say of the cameras, right or wrong, does not
-# enter. Its sigmas are multiplied by what its own residuals tell (a variance component, Förstner 1979, of each source
-# by itself).
 
 # Eigenvalues of a scaled normal matrix below this share of the largest are rounding.
 _RANK_TOLERANCE = 1e-10
@@ -350,16 +342,3 @@ def least(gram: Tensor) -> Least:
     root = Covariance(N * scale[:, None] * scale, scale, tolerance=_RANK_TOLERANCE).root
     pull = g @ root
     return Least(float(gram[-1, -1] - pull.square().sum()), root.shape[1], -root @ pull, root)
-
-
-def own_fits(problem: RigProblem, state: RigState) -> dict[str, GoodnessOfFit]:
-    """The fit of each kind of items alone, with what is known beforehand, from their rows at a solution of all."""
-    prior, found = problem.prior_rows(state), dict[str, GoodnessOfFit]()
-    known = prior @ prior.T
-    for block, gram in zip(problem.blocks, problem.block_grams(state), strict=True):
-        # The noise of boards' corners is estimated as it is.
-        if not block.many:
-            alone = least(gram + known)
-            rows = int((block.counts - block.size).sum()) + prior.shape[1]
-            found[block.kind] = GoodnessOfFit(alone.chi2, rows - alone.rank)
-    return found

@@ -15,10 +15,8 @@ from torch import Tensor
 from kcal.arrow import ArrowRows, arrow_table
 from kcal.calibrate.rig.adjustment import Adjustment, all_of
 from kcal.calibrate.rig.initial_poses import TurnedBoard
-from kcal.calibrate.rig.problem import RigProblem
-from kcal.calibrate.rig.source import RigState
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, parameter_rows, relative_rows
+from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.doors import shown_in_notebooks
 from kcal.finding import Finding, sentences
 from kcal.io.rig_file import save_rig
@@ -83,9 +81,7 @@ class RigResult(ArrowRows):
     undetermined: tuple[str, ...]
     status: SolverStatus
     findings: tuple[Finding, ...]
-    _problem: RigProblem
-    _state: RigState
-    _covariance: SharedCovariance
+    _solution: RigSolution
     _places: dict[str, dict[str, Tensor]]
     _provenance: dict[str, Any]
 
@@ -102,7 +98,7 @@ class RigResult(ArrowRows):
     @property
     def exact(self) -> tuple[str, ...]:
         """Names of the cameras that were taken as exact: errors of their lenses are in no covariance."""
-        maps = self._problem.unknowns.cameras
+        maps = self._solution.problem.unknowns.cameras
         return tuple(name for name, by_unknown in zip(self.names, maps, strict=True) if not bool(by_unknown.any()))
 
     @property
@@ -170,7 +166,7 @@ class RigResult(ArrowRows):
         rotation = self.rotation[second] @ self.rotation[first].T
         translation = self.rotation[second] @ (self.center[first] - self.center[second])
         rig = Rig.pair(self.cameras[first], self.cameras[second], rotation, translation)
-        half = self._covariance.half_of(self._joint_rows(first, second))
+        half = self._solution.half_of(self._joint_rows(first, second))
         if half is not None:
             rig.covariance = RigCovariance(half=half)
         rig.calibration = self._calibration(first, second)
@@ -187,9 +183,9 @@ class RigResult(ArrowRows):
             self.cameras, self.names, self.rotation, center=self.center, origin=origin if self.absolute else None,
             refraction=self.refraction if self.absolute and origin is not None else 0.0,
         )  # fmt: skip
-        poses = [mounting_rows(self._problem, self._state, camera) for camera in each]
-        lenses = [parameter_rows(self._problem, camera) for camera in each]
-        rig.root = self._covariance.half_of(torch.cat([*lenses, *(pose[:6] for pose in poses), poses[0][6:]]))
+        poses = [self._solution.mounting_rows(camera) for camera in each]
+        lenses = [self._solution.parameter_rows(camera) for camera in each]
+        rig.root = self._solution.half_of(torch.cat([*lenses, *(pose[:6] for pose in poses), poses[0][6:]]))
         rig.calibration = self._calibration(*each)
         return rig
 
@@ -234,30 +230,31 @@ class RigResult(ArrowRows):
 
     def relative_covariance(self, first: int = 0, second: int = 1) -> Tensor:
         """(6, 6) of second_from_first: rotation vector about the second camera's axes, translation along them."""
-        return self._covariance.of(relative_rows(self._problem, self._state, first, second))[0]
+        return self._solution.of(self._solution.relative_rows(first, second))[0]
 
     def joint_covariance(self, first: int = 0, second: int = 1) -> Tensor:
         """Covariance of both cameras' parameters (zeros where held) and relative pose, ordered as `RigCovariance`."""
-        return self._covariance.of(self._joint_rows(first, second))[0]
+        return self._solution.of(self._joint_rows(first, second))[0]
 
     @property
     def refraction(self) -> float:
         """Coefficient of refraction of the light from landmarks; its variance is the last of `mounting_covariance`."""
-        return float(self._state.refraction)
+        return float(self._solution.state.refraction)
 
     def effects(self) -> dict[str, tuple[float, float]]:
         """What shifts stars, landmarks or features together: its amount and standard deviation, in stated sigmas."""
-        maps = self._problem.unknowns.by_effects
+        problem = self._solution.problem
+        maps = problem.unknowns.by_effects
         if maps is None:
             return {}
-        rows = torch.nn.functional.pad(maps, (0, self._problem.shared_size - maps.shape[1]))
-        sigma, amount = self._covariance.variances(rows).sqrt(), maps @ self._state.unknown
+        rows = torch.nn.functional.pad(maps, (0, problem.shared_size - maps.shape[1]))
+        sigma, amount = self._solution.variances(rows).sqrt(), maps @ self._solution.state.unknown
         return dict(zip(self.data.effects, zip(amount.tolist(), sigma.tolist(), strict=True), strict=True))
 
     def mounting_link(self, first: int = 0, second: int = 1) -> Tensor:
         """(P, 7) covariance of `joint_covariance`'s P quantities with `mounting_covariance`'s of the first camera."""
-        rows = [self._joint_rows(first, second), mounting_rows(self._problem, self._state, first)]
-        return self._covariance.of(torch.cat(rows))[0][:-7, -7:]
+        rows = [self._joint_rows(first, second), self._solution.mounting_rows(first)]
+        return self._solution.of(torch.cat(rows))[0][:-7, -7:]
 
     def mounting_covariance(self, camera: int = 0) -> Tensor:
         """(7, 7) of a camera's center (meters), of small turns of it (radians), and of the coefficient of refraction.
@@ -265,11 +262,11 @@ class RigResult(ArrowRows):
         Centers and turns are along and about the local frame's axes. Infinite variances where the data leave something
         open; zeros for the first camera of a rig that is not `absolute`.
         """
-        return self._covariance.of(mounting_rows(self._problem, self._state, camera))[0]
+        return self._solution.of(self._solution.mounting_rows(camera))[0]
 
     def _joint_rows(self, first: int, second: int) -> Tensor:
-        rows = [parameter_rows(self._problem, camera) for camera in (first, second)]
-        return torch.cat([*rows, relative_rows(self._problem, self._state, first, second)])
+        rows = [self._solution.parameter_rows(camera) for camera in (first, second)]
+        return torch.cat([*rows, self._solution.relative_rows(first, second)])
 
 
 # Report a solved rig: residuals of every item and of every source, in pixels, meters and sigmas.

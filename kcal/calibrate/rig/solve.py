@@ -19,6 +19,7 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import spread_out
 from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, all_of, possible
 from kcal.calibrate.rig.assess import rig_result
+from kcal.calibrate.rig.contradictions import widen_sources
 from kcal.calibrate.rig.explanations import (
     cost_of_features_behind,
     explained,
@@ -296,7 +297,7 @@ def solve_rig(
     near = dataclasses.replace(options.solver, initial_damping=_NEAR_DAMPING)
     _, found = work.solve(mask, near)
     for _ in range(3):
-        change = max(work.fit_corners(mask), work.fit_widened(mask))
+        change = max(work.fit_corners(mask), widen_sources(work, mask))
         if change > 0.0:
             _, found = work.solve(mask, near)
         if change < 1e-3:

@@ -7,7 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -201,10 +201,10 @@ class Context(NamedTuple):
     state: RigState
     unknowns: SharedUnknowns
     anchor: Tensor
-    times: float
-    effects: Effects | None
-    sigma_corner: float
-    motion: Sequence[BoardMotion | None]
+    times: float = 1.0
+    effects: Effects | None = None
+    sigma_corner: float = 1.0
+    motion: Sequence[BoardMotion | None] = ()
 
 
 class ItemFit(NamedTuple):
@@ -278,35 +278,10 @@ class ItemSource(Source):
         if self.pixels.shape[1] != cameras:
             raise InputError(f"{self.kind}: pixels of {self.pixels.shape[1]} cameras, the rig has {cameras}")
 
-    def check_marks(self) -> None:
-        """Refuse marks that are not one in each camera for each name, and effects of another shape."""
-        shape, kind = self.pixels.shape, self.kind
-        if len(shape) != 3 or shape[::2] != (len(self.names), 2):
-            raise InputError(f"{kind}: pixels ({len(self.names)}, C, 2) are needed, got {tuple(shape)}")
-        check_names(kind, self.names, len(self.names))
-        for effect in self.effects:
-            shift, turn, factor = effect.shift, effect.turn, effect.factor
-            good = shift is None or (shift.shape == (*shape[:2], self.axes) and bool(torch.isfinite(shift).all()))
-            if not good or (kind != "stars" and (turn is not None or shift is None)):
-                axes = f"({kind[0].upper()}, C, {self.axes})"
-                raise InputError(f"{kind}: the effect of {effect.name} needs finite shifts {axes}")
-            if not ((turn is None or turn.shape == (shape[1], 3)) and (factor is None or factor.shape == shape[:1])):
-                raise InputError(f"{kind}: the effect of {effect.name} has another shape than stars and cameras")
-
     def shifts(self) -> Tensor:
         """(E, V, C, 3) shifts of the items by its effects, or (E, V, C, 2) px of the marks."""
         zero = torch.zeros(*self.pixels.shape[:2], self.axes, dtype=torch.float64)
         return torch.stack([zero, *(zero if effect.shift is None else effect.shift for effect in self.effects)])[1:]
-
-    def effects_with(self, other: ItemSource) -> tuple[Effect, ...]:
-        """Effects of its items and of others that follow them: each shifts its own alone."""
-        around = [(effect, (0, len(other.names))) for effect in self.effects]
-        around += [(effect, (len(self.names), 0)) for effect in other.effects]
-        return tuple(
-            dataclasses.replace(effect, shift=torch.nn.functional.pad(effect.shift, (0, 0, 0, 0, *more)))
-            for effect, more in around
-            if effect.shift is not None
-        )
 
     @property
     def marked(self) -> Tensor:
@@ -352,6 +327,70 @@ class ItemSource(Source):
     def places(self, items: Tensor, anchor: Tensor) -> Tensor | None:
         """(V, 3) meters in the local frame; None for what is at infinity."""
         return None
+
+
+class MarkSource(ItemSource):
+    """Items of which each camera that sees them has one mark.
+
+    Attributes:
+        pixel_sigma: of a mark along an axis, px; one number for all, or (V, C) for each mark.
+        covariance: (V, C, 2, 2) px² of marks, in place of `pixel_sigma`.
+    """
+
+    pixel_sigma: float | Tensor
+    covariance: Tensor | None = None
+
+    def check_marks(self) -> None:
+        """Refuse marks that are not one in each camera for each name, their sigmas, and effects of another shape."""
+        shape, kind, sigma, count = self.pixels.shape, self.kind, self.pixel_sigma, len(self.names)
+        if len(shape) != 3 or shape[::2] != (count, 2):
+            raise InputError(f"{kind}: pixels ({count}, C, 2) are needed, got {tuple(shape)}")
+        check_names(kind, self.names, count)
+        if not isinstance(sigma, Tensor):
+            require_positive(f"{kind}: pixel_sigma", sigma)
+        elif sigma.shape != shape[:2]:
+            raise InputError(f"{kind}: pixel_sigma {tuple(shape[:2])} is needed, one for each mark")
+        elif not bool((torch.isfinite(sigma) & (sigma > 0))[self.marked].all()):
+            raise InputError(f"{kind}: pixel_sigma must be a positive number of pixels wherever there is a mark")
+        if self.covariance is not None and self.covariance.shape != (*shape, 2):
+            raise InputError(f"{kind}: a covariance {(*shape, 2)} is needed, got {tuple(self.covariance.shape)}")
+        for effect in self.effects:
+            shift, turn, factor = effect.shift, effect.turn, effect.factor
+            good = shift is None or (shift.shape == (*shape[:2], self.axes) and bool(torch.isfinite(shift).all()))
+            if not good or (kind != "stars" and (turn is not None or shift is None)):
+                axes = f"({kind[0].upper()}, C, {self.axes})"
+                raise InputError(f"{kind}: the effect of {effect.name} needs finite shifts {axes}")
+            if not ((turn is None or turn.shape == (shape[1], 3)) and (factor is None or factor.shape == shape[:1])):
+                raise InputError(f"{kind}: the effect of {effect.name} has another shape than stars and cameras")
+
+    @property
+    def each_sigma(self) -> Tensor:
+        """(V, C) px, `pixel_sigma` of each mark."""
+        return torch.as_tensor(self.pixel_sigma, dtype=torch.float64).expand(self.pixels.shape[:2])
+
+    def whitening(self, times: float) -> Tensor:
+        """(V, C, 2, 2) by which residuals of pixels are multiplied, with sigmas so many times as large."""
+        if self.covariance is None:
+            return torch.eye(2, dtype=torch.float64) / (times * self.each_sigma[..., None, None])
+        # Where a mark is missing, its covariance may be anything.
+        return torch.linalg.inv(torch.linalg.cholesky_ex(self.covariance.nan_to_num(1.0))[0]) / times
+
+    @abstractmethod
+    def by_mark(self) -> Self:
+        """The same with the uncertainty of each mark, which two of a kind may be joined with."""
+
+    def __add__(self, other: Self) -> Self:
+        """Both; effects shift only those whose they are."""
+        one, two = self.by_mark(), other.by_mark()
+        around = [(effect, (0, len(two.names))) for effect in one.effects]
+        around += [(effect, (len(one.names), 0)) for effect in two.effects]
+        effects = tuple(
+            dataclasses.replace(effect, shift=torch.nn.functional.pad(effect.shift, (0, 0, 0, 0, *more)))
+            for effect, more in around
+            if effect.shift is not None
+        )
+        parts = {name: torch.cat([own, getattr(two, name)]) for name, own in vars(one).items() if torch.is_tensor(own)}
+        return dataclasses.replace(one, names=one.names + two.names, effects=effects, **parts)  # type: ignore[type-var]
 
 
 class Measurement(Source):
@@ -439,6 +478,11 @@ class Block(ABC):
         return 2 * self.seen.sum((-2, -1))
 
     @property
+    def freedom(self) -> Tensor:
+        """(V,) degrees of freedom of each item beyond its own unknowns."""
+        return self.counts - self.size
+
+    @property
     def added(self) -> Tensor:
         """(C,) how many more residuals the items have with each camera than without it."""
         seen = self.seen.sum(-1)
@@ -487,19 +531,18 @@ class MarkBlock(Block):
     """Items of which each camera that sees them has one mark.
 
     Args:
-        pixels: (V, C, 2), NaN where not seen.
-        whitening: (V, C, 2, 2) by which pixel residuals are multiplied.
-        effects: of the items; None without any.
+        source: of the items.
+        mask: which of them.
+        given: see there.
         priors: (V,) residuals of what is known of each item beforehand, or as many of each.
     """
 
-    def __init__(
-        self, pixels: Tensor, whitening: Tensor, effects: Effects | None = None, priors: Tensor | int = 0
-    ) -> None:
+    def __init__(self, source: MarkSource, mask: Tensor, given: Context, priors: Tensor | int) -> None:
+        pixels = source.pixels[mask]
         super().__init__(pixels[:, :, None])
-        self._effects, self._priors = effects, priors
+        self._effects, self._priors = given.effects and given.effects.some(mask), priors
         self._target = torch.where(self.seen, pixels, 0.0)[..., None]
-        self._whitening = torch.where(self.seen[..., None], whitening, 0.0)[..., None]
+        self._whitening = torch.where(self.seen[..., None], source.whitening(given.times)[mask], 0.0)[..., None]
 
     @property
     def counts(self) -> Tensor:

@@ -31,7 +31,6 @@ from kcal.calibrate.rig.source import (
     require_positive,
     typical_ratio,
 )
-from kcal.calibrate.rig.unknowns import SharedUnknowns
 from kcal.checks import chi2_quantile
 from kcal.corners.board import Board
 from kcal.errors import InputError
@@ -142,9 +141,7 @@ class Boards(ItemSource):
 
     def block(self, mask: Tensor, given: Context) -> Block:
         """See `ItemSource.block`."""
-        motion = [one and one.columns[mask] for one in given.motion]
-        weights = self.whitening(given.sigma_corner)[mask]
-        return BoardBlock(self.pixels[mask], weights, self.points, given.cameras, given.unknowns, motion)
+        return BoardBlock(self, mask, given)
 
     def over_limit(self, fit: ItemFit, level: float, given: Context, *, certain: bool) -> Tensor:
         """See `ItemSource.over_limit`; each board by the part of its χ² that is farther over its limit."""
@@ -213,46 +210,32 @@ class BoardBlock(Block):
 
     What a camera sees of them is its `BoardProblem`, whose poses cam_from_board follow from those of the board and of
     the camera in the world.
-
-    Args:
-        pixels: see `Block`.
-        whitening: (V, C, N) or (V, C, N, 2, 2) by which pixel residuals are multiplied.
-        board_points: (N, 3) meters.
-        cameras: of the rig.
-        unknowns: of cameras and board.
-        motion: for each camera (V, 12, 2, N) what boards move while it reads its rows; None where they stand still.
     """
 
     kind = "boards"
     size = 6
     many: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        pixels: Tensor,
-        whitening: Tensor,
-        board_points: Tensor,
-        cameras: Sequence[Camera],
-        unknowns: SharedUnknowns,
-        motion: Sequence[Tensor | None] = (),
-    ) -> None:
+    def __init__(self, source: Boards, mask: Tensor, given: Context) -> None:
+        pixels, points, unknowns = source.pixels[mask], source.points, given.unknowns
         super().__init__(pixels)
-        self._unknowns, flat = unknowns, board_points.new_zeros(0, *board_points.T.shape)
+        self._unknowns, flat = unknowns, points.new_zeros(0, *points.T.shape)
+        weights = source.whitening(given.sigma_corner)[mask]
         # What each camera sees, and what takes motions out of its rows; nothing for cameras that see no board.
         self._seen_by: dict[int, tuple[BoardProblem, WithoutMotion | None]] = {}
-        for c, camera in enumerate(cameras):
+        for c, camera in enumerate(given.cameras):
             if self._used[c]:
                 problem = BoardProblem(
-                    board_points,
+                    points,
                     pixels[:, c],
                     camera.model,
                     unknowns.cameras[c].any(1).nonzero()[:, 0].tolist(),
                     shapes=unknowns.shapes if len(unknowns.shapes) else flat,
                     free_board=bool(unknowns.board.any()),
-                    weights=whitening[:, c],
+                    weights=weights[:, c],
                 )
-                own = motion[c] if motion else None
-                self._seen_by[c] = problem, None if own is None else WithoutMotion(problem.weighted(own))
+                own = given.motion[c] if given.motion else None
+                self._seen_by[c] = problem, own and WithoutMotion(problem.weighted(own.columns[mask]))
 
     def _each(
         self, cameras: Sequence[PosedCamera], state: RigState

@@ -16,8 +16,8 @@ _NAMED_SHARE = 0.02
 _IDENTITY = torch.eye(3, dtype=torch.float64)
 
 
-class SharedCovariance(Covariance):
-    """Covariance of the shared unknowns of a rig at a solution, with all others free.
+class RigSolution(Covariance):
+    """A rig at a solution, with the covariance of its shared unknowns, all others free.
 
     Args:
         problem: the problem.
@@ -26,13 +26,13 @@ class SharedCovariance(Covariance):
     """
 
     def __init__(self, problem: RigProblem, state: RigState, variance: float = 1.0) -> None:
-        self._problem, self._state = problem, state
+        self.problem, self.state, self.variance = problem, state, variance
         super().__init__(*problem.linearize(state).information(), variance)
 
     def open_directions(self, names: Sequence[str], *, absolute: bool) -> tuple[str, ...]:
         """Names of what the data leave open, plainest first."""
         left, found = self.open, []
-        motions = _named_motions(self._problem, self._state, names, absolute=absolute)
+        motions = _named_motions(self.problem, self.state, names, absolute=absolute)
         while left.shape[1]:
             best: tuple[float, str, Tensor] = (0.0, "", left[0])
             for label, motion in motions:
@@ -44,13 +44,54 @@ class SharedCovariance(Covariance):
                     best = (share, label, inside)
             share, label, inside = best
             if share <= 1.0 - _NAMED_SHARE:
-                label = f"a mixture of {_largest_parts(self._problem, left[:, 0], names)}"
+                label = f"a mixture of {_largest_parts(self.problem, left[:, 0], names)}"
                 inside = torch.eye(left.shape[1], dtype=left.dtype)[0]
             found.append(label)
             # What is left of the open directions without the one that has a name now.
             rest = torch.linalg.svd(inside[None] / torch.linalg.vector_norm(inside)).Vh[1:]
             left = left @ rest.T
         return tuple(found)
+
+    def relative_rows(self, first: int, second: int) -> Tensor:
+        """(6, S): the step (ω, v) of second_from_first (see `apply_twist`) by a step of the shared unknowns."""
+        rotation, center = self.state.rotation, self.state.center
+        shift = rotation[second] @ (center[first] - center[second])
+        by_second = self.turn_rows(second)
+        turned = by_second - rotation[second] @ rotation[first].T @ self.turn_rows(first)
+        moved = rotation[second] @ (self.shift_rows(first) - self.shift_rows(second))
+        # ω × shift, column by column.
+        return torch.cat([turned, moved + torch.linalg.cross(by_second, shift[:, None].expand_as(by_second), dim=0)])
+
+    def mounting_rows(self, camera: int) -> Tensor:
+        """(7, S): shift of a camera's center, its turn about the world's axes, and the coefficient of refraction."""
+        unknowns, bending = self.problem.unknowns, self._rows(1)
+        if unknowns.by_refraction is not None:
+            bending[0, : len(unknowns)] = unknowns.by_refraction
+        return torch.cat([self.shift_rows(camera), -self.state.rotation[camera].T @ self.turn_rows(camera), bending])
+
+    def parameter_rows(self, camera: int) -> Tensor:
+        """(5 + P, S): all parameters of a camera, held ones with zeros."""
+        by_unknown = self.problem.unknowns.cameras[camera]
+        rows = self._rows(len(by_unknown))
+        rows[:, : by_unknown.shape[1]] = by_unknown
+        return rows
+
+    def turn_rows(self, camera: int) -> Tensor:
+        """(3, S): the turn of a camera about its own axes; zeros if it is held."""
+        return self._slot_rows(self.problem.turn[camera])
+
+    def shift_rows(self, camera: int) -> Tensor:
+        """(3, S): the shift of a camera's center; zeros if it is held."""
+        return self._slot_rows(self.problem.shift[camera])
+
+    def _slot_rows(self, slot: slice | None) -> Tensor:
+        rows = self._rows(3)
+        if slot is not None:
+            rows[:, slot] = _IDENTITY
+        return rows
+
+    def _rows(self, count: int) -> Tensor:
+        return torch.zeros(count, self.problem.shared_size, dtype=torch.float64)
 
 
 def _named_motions(
@@ -116,40 +157,3 @@ def _largest_parts(problem: RigProblem, direction: Tensor, names: Sequence[str])
             labels[shift_slot] = [f"where {name} stands"] * 3
     order = direction.abs().argsort(descending=True)[:4].tolist()
     return ", ".join(dict.fromkeys(labels[i] for i in order))
-
-
-def relative_rows(problem: RigProblem, state: RigState, first: int, second: int) -> Tensor:
-    """(6, S): the step (ω, v) of second_from_first (see `apply_twist`) by a step of the shared unknowns."""
-    rotation, center = state.rotation, state.center
-    shift = rotation[second] @ (center[first] - center[second])
-    by_first, by_second = (slot_rows(problem, problem.turn[c]) for c in (first, second))
-    turned = by_second - rotation[second] @ rotation[first].T @ by_first
-    moved, other = (slot_rows(problem, problem.shift[c]) for c in (first, second))
-    moved = rotation[second] @ (moved - other)
-    # ω × shift, column by column.
-    return torch.cat([turned, moved + torch.linalg.cross(by_second, shift[:, None].expand_as(by_second), dim=0)])
-
-
-def mounting_rows(problem: RigProblem, state: RigState, camera: int) -> Tensor:
-    """(7, S): shift of a camera's center, its turn about the world's axes, and the coefficient of refraction."""
-    bending = torch.zeros(1, problem.shared_size, dtype=torch.float64)
-    if problem.unknowns.by_refraction is not None:
-        bending[0, : len(problem.unknowns)] = problem.unknowns.by_refraction
-    turn, shift = (slot_rows(problem, slots[camera]) for slots in (problem.turn, problem.shift))
-    return torch.cat([shift, -state.rotation[camera].T @ turn, bending])
-
-
-def slot_rows(problem: RigProblem, slot: slice | None) -> Tensor:
-    """(3, S): the turn of a camera about its own axes, or the shift of its center, by its slot; None: it is held."""
-    rows = torch.zeros(3, problem.shared_size, dtype=torch.float64)
-    if slot is not None:
-        rows[:, slot] = _IDENTITY
-    return rows
-
-
-def parameter_rows(problem: RigProblem, camera: int) -> Tensor:
-    """(5 + P, S): all parameters of a camera, held ones with zeros."""
-    by_unknown = problem.unknowns.cameras[camera]
-    rows = by_unknown.new_zeros(len(by_unknown), problem.shared_size)
-    rows[:, : by_unknown.shape[1]] = by_unknown
-    return rows

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 
 import pytest
 import torch
@@ -13,9 +14,11 @@ from torch import Tensor
 from kcal import Baseline, DegenerateError, InputError, Landmarks, MeasuredPosition, RigData, RigOptions, solve_rig
 from kcal.calibrate.rig import assess
 from kcal.calibrate.rig.adjustment import Adjustment
-from kcal.calibrate.rig.explanations import contradiction, redundancy
+from kcal.calibrate.rig.contradictions import contradicting_source
+from kcal.calibrate.rig.explanations import redundancy
 from kcal.calibrate.rig.initial_poses import first_poses
 from kcal.calibrate.rig.resection import distinct_poses, poses_from_three
+from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.calibrate.rig.unknowns import held
 from kcal.lens import rotation_from_vector
 from kcal.report import rig_verdict
@@ -223,9 +226,10 @@ class TestContradictions:
         sources = data(landmarks=marked(), baselines=baseline(1.01 * APART, 0.005))
         whole, without = adjusted(sources), adjusted(dataclasses.replace(sources, baselines=()))
         problem, state = (whole[0].problem(whole[1]), whole[0].part(whole[1]))
-        found = contradiction(whole[0], problem, state)
+        (found,) = contradicting_source(whole[0], RigSolution(problem, state), refuse=False)
         chi2 = [2.0 * float(work.problem(masks).cost(work.part(masks))) for work, masks in (whole, without)]
-        assert found.sigmas == pytest.approx(math.sqrt(chi2[0] - chi2[1]), rel=0.02)
+        sigmas = float(re.findall(r"\(([0-9.]+) standard deviations\)", found.text)[0])
+        assert sigmas == pytest.approx(math.sqrt(chi2[0] - chi2[1]), rel=0.02)
 
 
 def _seen(points: Tensor, camera: int) -> Tensor:

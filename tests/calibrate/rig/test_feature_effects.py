@@ -60,7 +60,7 @@ def test_effect_is_found_with_its_sigma(amount: float) -> None:
 
 def test_derivatives_are_those_of_differences() -> None:
     result = solved(features(scattered(0.5), 0.8))
-    problem, state = result._problem, result._state
+    problem, state = result._solution.problem, result._solution.state
     block = problem.blocks[0]
     rows = block.rows(problem.posed(state), state, problem.shared_size)[:, block.size]
     step = 1e-4

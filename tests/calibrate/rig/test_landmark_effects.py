@@ -57,7 +57,7 @@ def test_without_effect_the_same_points_contradict() -> None:
 
 
 def test_derivatives_are_those_of_differences() -> None:
-    problem, state = (lambda result: (result._problem, result._state))(solved(landmarks(0.8)))
+    problem, state = (lambda result: (result._solution.problem, result._solution.state))(solved(landmarks(0.8)))
     block = problem.blocks[0]
     rows = block.rows(problem.posed(state), state, problem.shared_size)[:, block.size]
     step = 1e-4

@@ -18,8 +18,8 @@ from kcal.calibrate.hybrid.evidence import EvidenceLoss, view_data
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.rig.motion import CameraRows, RigRows, WithoutMotion
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.source import PosedCamera, RigState, as_items
-from kcal.calibrate.rig.sources import BoardBlock
+from kcal.calibrate.rig.source import Context, PosedCamera, RigState, as_items
+from kcal.calibrate.rig.sources import Boards
 from kcal.calibrate.rig.unknowns import held
 from kcal.lens import CameraCalibration
 from kcal.lens.pose import Pose, rotation_from_vector, vector_from_rotation
@@ -98,7 +98,8 @@ def test_rows_are_read_at_the_times_of_the_pixels_shown() -> None:
     )
     for noise in (0.0, 5.0):
         pixels = CAMERA.project(BOARD.points @ at.rotation.mT + at.translation[:, None])[0][:, None] + noise
-        block = BoardBlock(pixels, torch.ones(3, 1, BOARD.corners).double(), BOARD.points, [CAMERA], held([CAMERA]))
+        shown = Boards(board=BOARD, pixels=pixels, names=("a", "b", "c"))
+        block = shown.block(torch.ones(3, dtype=torch.bool), Context([CAMERA], state, held([CAMERA]), state.center[0]))
         found.append(block.motion_columns(0, posed, state, reads=True)[0])
     assert torch.equal(*found)
 

@@ -11,9 +11,8 @@ from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, features, landmarks
 from torch import Tensor
 
 from kcal import Baseline, InputError, Landmarks, RigData, RigOptions, solve_rig
-from kcal.calibrate.rig.problem import own_fits
+from kcal.calibrate.rig.contradictions import own_fits
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.uncertainty import slot_rows
 from kcal.lens import vector_from_rotation
 
 LENGTH = float((CENTER[1] - CENTER[0]).norm())
@@ -41,7 +40,7 @@ def solved(noise: float, seed: int, matches: int = 300, length: float = LENGTH) 
 def over_sigma(found: RigResult) -> Tensor:
     """(3,) error of the left camera's attitude over its standard deviation."""
     error = vector_from_rotation(found.rotation[0] @ ROTATION[0].T)
-    return error / found._covariance.variances(slot_rows(found._problem, found._problem.turn[0])).sqrt()
+    return error / found._solution.variances(found._solution.turn_rows(0)).sqrt()
 
 
 def of(found: RigResult, source: str) -> float:
@@ -86,7 +85,7 @@ def test_a_wrong_tape_beside_marks_that_are_worse_than_stated() -> None:
 def test_degrees_of_freedom() -> None:
     """Alone, twelve places marked twice leave 48 residuals less 12 unknowns; matches, one each, less 5 of a pose."""
     found = solved(STATED, 2)
-    fits = own_fits(found._problem, found._state)
+    fits = own_fits(found._solution.problem, found._solution.state)
     assert fits["landmarks"].freedom == 12 * 4 - 12
     assert fits["features"].freedom == 300 - 5
     assert fits["landmarks"].chi2 == pytest.approx(fits["landmarks"].freedom, rel=3 * math.sqrt(2 / 36))

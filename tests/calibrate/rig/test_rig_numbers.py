@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 import torch
 from rig_scenes import (
-    BOARD,
     CAMERAS,
     CENTER,
     NAMES,
@@ -25,13 +25,23 @@ from torch import Tensor
 
 from kcal import Baseline, DegenerateError, MeasuredPosition
 from kcal.calibrate.rig.assess import _advice, _Targets
-from kcal.calibrate.rig.explanations import _Part, _test, least_redundancy, redundancy, refuse_exact
-from kcal.calibrate.rig.marks import FeatureBlock, LandmarkBlock
+from kcal.calibrate.rig.contradictions import Part, _test
+from kcal.calibrate.rig.explanations import least_redundancy, redundancy, refuse_exact
+from kcal.calibrate.rig.marks import Features, Landmarks
 from kcal.calibrate.rig.motion import CameraRows, summed_products
 from kcal.calibrate.rig.problem import RigProblem, _of_item, least
-from kcal.calibrate.rig.source import Block, Measurement, RigState, Start, as_items, first_rays, typical_ratio
-from kcal.calibrate.rig.sources import BoardBlock
-from kcal.calibrate.rig.uncertainty import SharedCovariance, mounting_rows, relative_rows
+from kcal.calibrate.rig.source import (
+    Block,
+    Context,
+    ItemSource,
+    Measurement,
+    RigState,
+    Start,
+    as_items,
+    first_rays,
+    typical_ratio,
+)
+from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.calibrate.rig.unknowns import _moving, held
 from kcal.checks import chi2_quantile
 from kcal.lens import vector_from_rotation
@@ -39,8 +49,11 @@ from kcal.rig import planned_rig
 from kcal.watch.turned import drift_of_turns
 
 
-def white(pixels: Tensor) -> Tensor:
-    return torch.eye(2).double().expand(*pixels.shape, 2)
+def block_of(source: ItemSource, anchor: Tensor | None = None) -> Block:
+    """The rows of all its items; sources do not look at the state."""
+    cameras = CAMERAS[: source.pixels.shape[1]]
+    given = Context(cameras, None, held(cameras), CENTER.mean(0) if anchor is None else anchor)  # type: ignore[arg-type]
+    return source.block(torch.ones(len(source.names), dtype=torch.bool), given)
 
 
 def problem_of(
@@ -50,19 +63,19 @@ def problem_of(
     return RigProblem(cameras, list(blocks), terms, held(cameras), list(loose), list(loose))
 
 
-def landmark_block(*missing: tuple[int, int], count: int = 4) -> LandmarkBlock:
+def landmark_block(*missing: tuple[int, int], count: int = 4) -> Block:
     marks = landmarks(count=count, cameras=2)
     for item, camera in missing:
         marks.pixels[item, camera] = torch.nan
-    return LandmarkBlock(marks.pixels, white(marks.pixels), marks.points, marks.sigma)
+    return block_of(marks)
 
 
-def feature_block(*missing: tuple[int, int], known: bool = False, cameras: int = 2) -> FeatureBlock:
+def feature_block(*missing: tuple[int, int], known: bool = False, cameras: int = 2) -> Block:
     far = features(count=4, cameras=cameras)
     for item, camera in missing:
         far.pixels[item, camera] = torch.nan
     sigma = torch.full((4,), 1e-6 if known else math.inf).double()
-    return FeatureBlock(far.pixels, white(far.pixels), far.inverse_range, sigma, CENTER.mean(0))
+    return block_of(dataclasses.replace(far, inverse_range_sigma=sigma))
 
 
 class TestRedundancy:
@@ -84,8 +97,7 @@ class TestRedundancy:
     def test_boards_and_what_was_measured(self) -> None:
         shown = boards(count=2, cameras=2)
         shown.pixels[1, 1] = torch.nan
-        block = BoardBlock(shown.pixels, white(shown.pixels), BOARD.points, CAMERAS[:2], held(CAMERAS[:2]))
-        assert redundancy(problem_of(block)) == [2 * 42 - 6, 2 * 42 - 6]
+        assert redundancy(problem_of(block_of(shown))) == [2 * 42 - 6, 2 * 42 - 6]
         terms = (
             Baseline(first=0, second=1, length=10.0, sigma=0.01),
             MeasuredPosition(camera=1, point=CENTER[1], sigma=tensor(0.1, 0.1, 0.1)),
@@ -123,14 +135,14 @@ class TestStatistics:
         both = torch.cat([rows, right[:, None]], 1)
         assert least(both.T @ both).rank == 2
 
-    def part(self, value: float, sigma: float, count: int = 1) -> _Part:
+    def part(self, value: float, sigma: float, count: int = 1) -> Part:
         """One unknown, measured so many times."""
         row = tensor(1.0 / sigma, -value / sigma)
-        return _Part("", count * torch.outer(row, row), count, None)
+        return Part("", count * torch.outer(row, row), count, None)
 
     def test_one_source_against_another(self) -> None:
         """Two measurements five apart with a sigma of one each: 25 / 2, and the root of it in standard deviations."""
-        nothing = _Part("", torch.zeros(2, 2).double(), 0, None)
+        nothing = Part("", torch.zeros(2, 2).double(), 0, None)
         parts = [self.part(0.0, 1.0), self.part(5.0, 1.0)]
         test = _test(parts, (1,), (0, 1), nothing)
         assert (test.freedom, test.chi2, test.sigmas) == (1, pytest.approx(12.5), pytest.approx(math.sqrt(12.5)))
@@ -141,20 +153,20 @@ class TestStatistics:
         assert alone == (0.0, 0, 0.0)
         # Two unknowns at once, by Wilson and Hilferty.
         rows = [torch.cat([torch.eye(2), -torch.tensor([[a], [b]])], 1).double() for a, b in ((0.0, 0.0), (3.0, 4.0))]
-        two = [_Part("", r.T @ r, 2, None) for r in rows]
-        pair = _test(two, (0,), (0, 1), _Part("", torch.zeros(3, 3).double(), 0, None))
+        two = [Part("", r.T @ r, 2, None) for r in rows]
+        pair = _test(two, (0,), (0, 1), Part("", torch.zeros(3, 3).double(), 0, None))
         assert (pair.freedom, pair.chi2) == (2, pytest.approx(12.5))
         # Chance exceeds 12.5 as seldom as 2.9 standard deviations of a normal variable: exp(-6.25) = .0019.
         assert pair.sigmas == pytest.approx(2.89, abs=0.05)
 
     def test_sigmas_that_are_too_small_throughout_count_by_what_residuals_are(self) -> None:
         """Twenty measurements of each source that scatter ten times as much as they say."""
-        nothing = _Part("", torch.zeros(2, 2).double(), 0, None)
+        nothing = Part("", torch.zeros(2, 2).double(), 0, None)
         scatter = 10.0 * torch.linspace(-1.5, 1.5, 20).double()
         parts = []
         for middle in (0.0, 4.0):
             rows = torch.stack([torch.ones(20).double(), -(middle + scatter)], 1)
-            parts.append(_Part("", rows.T @ rows, 20, None))
+            parts.append(Part("", rows.T @ rows, 20, None))
         test = _test(parts, (0,), (0, 1), nothing)
         variance = 2.0 * float(scatter.square().sum()) / 38.0
         assert test.chi2 == pytest.approx(16.0 / (2.0 / 20.0) / variance)
@@ -203,7 +215,8 @@ class TestRows:
     def test_poses_follow_the_unknowns(self) -> None:
         """Relative pose, center and turn about the world's axes, by steps of each unknown."""
         problem, state = self.problem()
-        relative, mounting = relative_rows(problem, state, 0, 1), mounting_rows(problem, state, 1)
+        solution = RigSolution(problem, state)
+        relative, mounting = solution.relative_rows(0, 1), solution.mounting_rows(1)
 
         def after(step: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
             moved = problem.retract(state, (step, torch.zeros(4, 6).double()))
@@ -245,30 +258,35 @@ class TestOpen:
         """Things of unknown range tell how two cameras stand but for the scale; without a frame, not where they are."""
         points = spread_points(8, 60.0, 900.0, 9)
         pixels = torch.stack([see(points, c) for c in (0, 1)], 1)
-        unknown = torch.zeros(8).double(), torch.full((8,), math.inf).double()
+        far = Features(
+            names=tuple("abcdefgh"),
+            pixels=pixels,
+            inverse_range=torch.zeros(8).double(),
+            inverse_range_sigma=torch.full((8,), math.inf).double(),
+        )
         anchor = CENTER.mean(0)
-        block = FeatureBlock(pixels, white(pixels), *unknown, anchor)
+        block = block_of(far, anchor)
         towards = points - anchor
         length = towards.norm(dim=-1)
         state = TestRows().problem()[1]._replace(items=as_items(towards / length[:, None], 1.0 / length[:, None]))
-        held_first = SharedCovariance(problem_of(block, loose=(False, True)), state, 4.0)
+        held_first = RigSolution(problem_of(block, loose=(False, True)), state, 4.0)
         scale = "the scale (how far apart the cameras stand)"
         assert held_first.open_directions(NAMES[:2], absolute=False) == (scale,)
-        free = SharedCovariance(problem_of(block), state, 1.0).open_directions(NAMES[:2], absolute=True)
+        free = RigSolution(problem_of(block), state, 1.0).open_directions(NAMES[:2], absolute=True)
         assert free[:6] == (
             "where the rig stands (east)", "where the rig stands (north)", "where the rig stands (up)",
             "the heading (a turn about the vertical)", "a turn of the rig about its baseline", scale,
         )  # fmt: skip
         assert len(free) == 7
         # How the second camera is turned is known, where it stands is not: along the baseline alone.
-        problem = problem_of(block, loose=(False, True))
-        covariance, known = held_first.of(relative_rows(problem, state, 0, 1))
+        relative = held_first.relative_rows(0, 1)
+        covariance, known = held_first.of(relative)
         assert known.tolist() == [True] * 3 + [False] * 3
         assert bool(torch.isinf(covariance.diagonal()[3:]).all())
-        narrow = SharedCovariance(problem, state, 1.0).of(relative_rows(problem, state, 0, 1))[0]
+        narrow = RigSolution(held_first.problem, state).of(relative)[0]
         torch.testing.assert_close(covariance[:3, :3], 4.0 * narrow[:3, :3])
-        assert held_first.half_of(relative_rows(problem, state, 0, 1)) is None
-        variances = held_first.variances(relative_rows(problem, state, 0, 1))
+        assert held_first.half_of(relative) is None
+        variances = held_first.variances(relative)
         torch.testing.assert_close(variances[:3], covariance.diagonal()[:3])
         assert bool(torch.isinf(variances[3:]).all())
 
@@ -291,7 +309,8 @@ class TestWeak:
         """100 m away; by their extents along three axes."""
         corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0]).double()] * 3) * tensor(*extent)
         middle = CENTER[0] + 100.0 * ROTATION[0, 2]
-        marks = LandmarkBlock(torch.zeros(8, 2, 2).double(), torch.zeros(8, 2, 2, 2).double(), corners, corners)
+        pixels = torch.zeros(8, 2, 2).double()
+        marks = block_of(Landmarks(names=tuple("abcdefgh"), points=corners, sigma=corners.abs(), pixels=pixels))
         state = TestRows().problem()[1]._replace(items=as_items(corners + middle))
         assert words in _advice(problem_of(marks), state)
         assert _advice(problem_of(feature_block()), TestRows().problem()[1]).startswith(

@@ -29,14 +29,13 @@ from torch import Tensor
 from kcal import Baseline, MeasuredPosition, RigData
 from kcal.calibrate.rig import initial_poses, solve
 from kcal.calibrate.rig import sources as board_limits
-from kcal.calibrate.rig.marks import FeatureBlock, LandmarkBlock, inverse_range_beyond
+from kcal.calibrate.rig.marks import Features, inverse_range_beyond
 from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
-from kcal.calibrate.rig.source import PosedCamera, RigState, Start, as_items
-from kcal.calibrate.rig.sources import BoardBlock
-from kcal.calibrate.rig.unknowns import SharedUnknowns, joint_unknowns
+from kcal.calibrate.rig.source import Context, PosedCamera, RigState, Start, as_items
+from kcal.calibrate.rig.unknowns import SharedUnknowns, held, joint_unknowns
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
@@ -85,14 +84,11 @@ def mixed_problem() -> tuple[RigProblem, RigState]:
     far = features(count=4, cameras=3, noise=0.3, known=0.2)
     shown = boards(count=2, cameras=3, noise=0.2)
     shown.pixels[1, 1, 3] = torch.nan
-    identity = torch.eye(2, dtype=torch.float64)
-
-    def white(pixels: Tensor) -> Tensor:
-        skewed = identity / 0.3 + tensor([0.0, 0.7], [0.2, 0.0])
-        return skewed.expand(*pixels.shape, 2)
-
-    sigma = far.inverse_range_sigma.clone()
-    sigma[1] = math.inf
+    skewed = torch.linalg.inv(torch.eye(2, dtype=torch.float64) / 0.3 + tensor([0.0, 0.7], [0.2, 0.0]))
+    far, shown = (
+        dataclasses.replace(one, covariance=(skewed @ skewed.T).expand(*one.pixels.shape, 2)) for one in (far, shown)
+    )
+    far.inverse_range_sigma[1] = math.inf
     anchor = CENTER.mean(0)
     # Unknowns that move two cameras at once, and all of them the board.
     maps = [1e-2 * normal((len(camera.names), 5), 11 + c) for c, camera in enumerate(CAMERAS)]
@@ -108,11 +104,9 @@ def mixed_problem() -> tuple[RigProblem, RigState]:
         labels=("",) * 5,
         by_refraction=tensor(0.0, 0.1, 0.0, 0.2, 0.3),
     )
-    blocks = [
-        BoardBlock(shown.pixels, white(shown.pixels), BOARD.points, CAMERAS, unknowns),
-        LandmarkBlock(marks.pixels, white(marks.pixels), marks.points, marks.sigma, unknowns.by_refraction),
-        FeatureBlock(far.pixels, white(far.pixels), far.inverse_range, sigma, anchor),
-    ]
+    # Sources do not look at the state.
+    given = Context(CAMERAS, None, unknowns, anchor)  # type: ignore[arg-type]
+    blocks = [one.block(torch.ones(len(one.names), dtype=torch.bool), given) for one in (shown, marks, far)]
     terms = [
         Baseline(first=0, second=1, length=10.0, sigma=0.01),
         MeasuredPosition(camera=1, point=CENTER[1] + 0.1, sigma=tensor(0.1, 0.2, 0.3)),
@@ -227,14 +221,15 @@ def test_features_of_hybrid_cameras_are_seen_where_they_are(distance: float) -> 
     pixels, valid = hybrid.project_rays(rays) if math.isinf(distance) else hybrid.project(rays)
     assert bool(valid.all())
     inverse = torch.full((2,), 1.0 / distance, dtype=torch.float64)
-    white = torch.eye(2, dtype=torch.float64).expand(2, 1, 2, 2)
     origin = torch.zeros(3, dtype=torch.float64)
-    block = FeatureBlock(pixels[:, None], white, inverse, torch.full((2,), 1e-3).double(), origin)
+    sigma = torch.full((2,), 1e-3).double()
+    far = Features(names=("a", "b"), pixels=pixels[:, None], inverse_range=inverse, inverse_range_sigma=sigma)
     nothing = torch.zeros(0, 3, dtype=torch.float64)
     state = RigState(
         hybrid.params.detach(), origin[:0], tensor(0.0), torch.eye(3).double()[None], origin[None], origin[:0],
         as_items(direction, inverse[:, None]),
     )  # fmt: skip
+    block = far.block(torch.ones(2, dtype=torch.bool), Context([hybrid], state, held([hybrid]), origin))
     posed = [PosedCamera(hybrid, hybrid.params.detach(), torch.eye(3).double(), origin, nothing.T[:0], None, None)]
     assert float(block.errors(posed, state).abs().max()) < 1e-9
     rows = block.rows(posed, state, 0)
@@ -512,7 +507,7 @@ class TestWrong:
     def test_deletions_are_what_leaving_out_does(self) -> None:
         marks = landmarks(noise=0.1, error=0.02)
         whole = solve_rig(data(landmarks=marks, baselines=BASELINE), RigOptions(reject=False))
-        falls = whole._problem.deletions(whole._state)[0]
+        falls = whole._solution.problem.deletions(whole._solution.state)[0]
         for i in (0, 5, 11):
             rest = data(landmarks=dataclasses.replace(marks, pixels=_without(marks.pixels, i)), baselines=BASELINE)
             without = solve_rig(rest, RigOptions(reject=False))

@@ -50,7 +50,7 @@ def solved(seen: Landmarks, options: RigOptions = HELD, sigma: float | None = No
 
 
 def place(found: RigResult) -> OpenPlace:
-    checked = open_place(found._problem, found._state, found._covariance, 0, 1)
+    checked = open_place(found._solution, 0, 1)
     assert checked is not None
     return checked
 
@@ -140,7 +140,7 @@ class TestOrdinary:
     def test_sigmas_are_those_of_the_localizer(self) -> None:
         found = solved(landmarks(noise=0.2, error=0.02))
         rig = found.stereo()
-        targets = _targets(found._problem, found._state, found._covariance, (0, 1), 1.0 / 200.0)
+        targets = _targets(found._solution, 0, 1, 1.0 / 200.0)
         assert targets is not None
         localize = Localizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1)
         for far in (200.0, 370.0, 900.0, 5000.0):
