@@ -13,11 +13,10 @@ from torch import Tensor
 
 import kcal.calibrate.rig.adjustment as adjustment
 from kcal.calibrate.rig.marks import Features, Landmarks
-from kcal.calibrate.rig.problem import goodness_of_fit
+from kcal.calibrate.rig.problem import RigSolution, goodness_of_fit
 from kcal.calibrate.rig.result import records
 from kcal.calibrate.rig.source import Start, typical_ratio
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.calibrate.rig.unknowns import held
 from kcal.checks import as_points, beyond_chance, chi2_quantile, variance_factor
 from kcal.errors import DegenerateError, InputError

@@ -23,8 +23,8 @@ from kcal.calibrate.rig import assess
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.contradictions import widen_for_parts
 from kcal.calibrate.rig.pairs import paired_boards
+from kcal.calibrate.rig.problem import RigSolution
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.finding import Finding
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.rig import RigCovariance

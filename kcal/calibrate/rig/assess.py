@@ -17,11 +17,10 @@ from kcal.calibrate.rig.contradictions import contradicting_source, sigmas_findi
 from kcal.calibrate.rig.initial_poses import InitialPoses
 from kcal.calibrate.rig.marks import Features
 from kcal.calibrate.rig.motion import moved_findings, scatter_findings
-from kcal.calibrate.rig.problem import RigProblem, goodness_of_fit
+from kcal.calibrate.rig.problem import RigProblem, RigSolution, goodness_of_fit
 from kcal.calibrate.rig.resection import distinct_poses
 from kcal.calibrate.rig.result import Reasons, RigResult, places, records
 from kcal.calibrate.rig.source import Context, RigState, as_items
-from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding
 from kcal.io.camera_file import provenance

@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import Adjustment
-from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, least
+from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, RigSolution, least
 from kcal.calibrate.rig.source import ItemSource, RigState
-from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.checks import beyond_chance, variance_factor
 from kcal.errors import InputError
 from kcal.finding import Finding

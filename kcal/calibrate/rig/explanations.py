@@ -14,11 +14,10 @@ from torch import Tensor
 from kcal.calibrate.rig.adjustment import LOSS, MOST_WRONG, ROUGHLY, Adjustment, without_wrong
 from kcal.calibrate.rig.contradictions import parts_of
 from kcal.calibrate.rig.marks import FeatureBlock
-from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, goodness_of_fit, least
+from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, RigSolution, goodness_of_fit, least
 from kcal.calibrate.rig.resection import consensus_pose
 from kcal.calibrate.rig.source import RigState
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding
 from kcal.solve.lm import LMOptions

@@ -342,3 +342,131 @@ def least(gram: Tensor) -> Least:
     root = Covariance(N * scale[:, None] * scale, scale, tolerance=_RANK_TOLERANCE).root
     pull = g @ root
     return Least(float(gram[-1, -1] - pull.square().sum()), root.shape[1], -root @ pull, root)
+
+
+# A solved rig: what its data determine of the shared unknowns, and names for what they leave open.
+
+# A motion gives an open direction its name if it lies in the open directions but for this share.
+_NAMED_SHARE = 0.02
+_IDENTITY = torch.eye(3, dtype=torch.float64)
+
+
+class RigSolution(Covariance):
+    """A rig at a solution, with the covariance of its shared unknowns, all others free.
+
+    Args:
+        problem: the problem.
+        state: its solution.
+        variance: by which the covariance is multiplied: 1 where the stated sigmas are right.
+    """
+
+    def __init__(self, problem: RigProblem, state: RigState, variance: float = 1.0) -> None:
+        self.problem, self.state, self.variance = problem, state, variance
+        super().__init__(*problem.linearize(state).information(), variance)
+
+    def open_directions(self, names: Sequence[str], *, absolute: bool) -> tuple[str, ...]:
+        """Names of what the data leave open, plainest first."""
+        left, found = self.open, []
+        motions = self._named_motions(names, absolute=absolute)
+        while left.shape[1]:
+            best: tuple[float, str, Tensor] = (0.0, "", left[0])
+            for label, motion in motions:
+                scaled = motion / self._scale
+                inside = left.T @ (scaled / torch.linalg.vector_norm(scaled))
+                share = float(inside.square().sum())
+                # Of names that say the same, the first.
+                if share > best[0] + 1e-6:
+                    best = (share, label, inside)
+            share, label, inside = best
+            if share <= 1.0 - _NAMED_SHARE:
+                label = f"a mixture of {self._largest_parts(left[:, 0], names)}"
+                inside = torch.eye(left.shape[1], dtype=left.dtype)[0]
+            found.append(label)
+            # What is left of the open directions without the one that has a name now.
+            rest = torch.linalg.svd(inside[None] / torch.linalg.vector_norm(inside)).Vh[1:]
+            left = left @ rest.T
+        return tuple(found)
+
+    def _named_motions(self, names: Sequence[str], *, absolute: bool) -> list[tuple[str, Tensor]]:
+        """Motions (S,) of the cameras that people have a name for."""
+        rotation, center = self.state.rotation, self.state.center
+        middle, each, out = center.mean(0), range(len(names)), list[tuple[str, Tensor]]()
+
+        def rig_motion(label: str, turn: Tensor, shift: Tensor) -> None:
+            turned = [-(rotation[c] @ turn) @ self.turn_rows(c) + shift[c] @ self.shift_rows(c) for c in each]
+            if bool((motion := torch.stack(turned).sum(0)).any()):
+                out.append((label, motion))
+
+        zero = torch.zeros(3, dtype=torch.float64)
+        if absolute:
+            for axis, word in zip(_IDENTITY, ("east", "north", "up"), strict=True):
+                rig_motion(f"where the rig stands ({word})", zero, axis.expand_as(center))
+            along = center[min(1, len(center) - 1)] - center[0]
+            turns = [(_IDENTITY[2], "the heading (a turn about the vertical)")]
+            turns += [
+                (axis, f"a tilt of the rig about the {word} axis")
+                for axis, word in zip(_IDENTITY[:2], ("east", "north"), strict=True)
+            ]
+            if bool(along.any()):
+                turns.append((along / torch.linalg.vector_norm(along), "a turn of the rig about its baseline"))
+            for axis, label in turns:
+                for pivot in (middle, *center):
+                    rig_motion(label, axis, torch.linalg.cross(axis.expand_as(center), center - pivot))
+        fixed = center[0] if self.problem.shift[0] is None else middle
+        rig_motion("the scale (how far apart the cameras stand)", zero, center - fixed)
+        for c, name in enumerate(names):
+            labels = [f"the {word} of {name}" for word in ("pitch", "yaw", "roll")]
+            labels += [f"where {name} stands ({word})" for word in ("sideways", "up and down", "along its axis")]
+            motions = torch.cat([self.turn_rows(c), rotation[c] @ self.shift_rows(c)])
+            out += [(label, motion) for label, motion in zip(labels, motions, strict=True) if bool(motion.any())]
+        single = torch.eye(self.problem.shared_size, dtype=torch.float64)
+        return out + [(label, axis) for label, axis in zip(self.problem.unknowns.labels, single, strict=False) if label]
+
+    def _largest_parts(self, direction: Tensor, names: Sequence[str]) -> str:
+        labels = list(self.problem.unknowns.labels)
+        for name, turn, shift in zip(names, self.problem.turn, self.problem.shift, strict=True):
+            labels += [f"the attitude of {name}"] * (3 * (turn is not None))
+            labels += [f"where {name} stands"] * (3 * (shift is not None))
+        order = direction.abs().argsort(descending=True)[:4].tolist()
+        return ", ".join(dict.fromkeys(labels[i] for i in order))
+
+    def relative_rows(self, first: int, second: int) -> Tensor:
+        """(6, S): the step (ω, v) of second_from_first (see `apply_twist`) by a step of the shared unknowns."""
+        rotation, center = self.state.rotation, self.state.center
+        shift = rotation[second] @ (center[first] - center[second])
+        by_second = self.turn_rows(second)
+        turned = by_second - rotation[second] @ rotation[first].T @ self.turn_rows(first)
+        moved = rotation[second] @ (self.shift_rows(first) - self.shift_rows(second))
+        # ω × shift, column by column.
+        return torch.cat([turned, moved + torch.linalg.cross(by_second, shift[:, None].expand_as(by_second), dim=0)])
+
+    def mounting_rows(self, camera: int) -> Tensor:
+        """(7, S): shift of a camera's center, its turn about the world's axes, and the coefficient of refraction."""
+        unknowns, bending = self.problem.unknowns, self._rows(1)
+        if unknowns.by_refraction is not None:
+            bending[0, : len(unknowns)] = unknowns.by_refraction
+        return torch.cat([self.shift_rows(camera), -self.state.rotation[camera].T @ self.turn_rows(camera), bending])
+
+    def parameter_rows(self, camera: int) -> Tensor:
+        """(5 + P, S): all parameters of a camera, held ones with zeros."""
+        by_unknown = self.problem.unknowns.cameras[camera]
+        rows = self._rows(len(by_unknown))
+        rows[:, : by_unknown.shape[1]] = by_unknown
+        return rows
+
+    def turn_rows(self, camera: int) -> Tensor:
+        """(3, S): the turn of a camera about its own axes; zeros if it is held."""
+        return self._slot_rows(self.problem.turn[camera])
+
+    def shift_rows(self, camera: int) -> Tensor:
+        """(3, S): the shift of a camera's center; zeros if it is held."""
+        return self._slot_rows(self.problem.shift[camera])
+
+    def _slot_rows(self, slot: slice | None) -> Tensor:
+        rows = self._rows(3)
+        if slot is not None:
+            rows[:, slot] = _IDENTITY
+        return rows
+
+    def _rows(self, count: int) -> Tensor:
+        return torch.zeros(count, self.problem.shared_size, dtype=torch.float64)

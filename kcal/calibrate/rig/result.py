@@ -15,8 +15,8 @@ from torch import Tensor
 from kcal.arrow import ArrowRows, arrow_table
 from kcal.calibrate.rig.adjustment import Adjustment, all_of
 from kcal.calibrate.rig.initial_poses import TurnedBoard
+from kcal.calibrate.rig.problem import RigSolution
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.doors import shown_in_notebooks
 from kcal.finding import Finding, sentences
 from kcal.io.rig_file import save_rig

@@ -17,8 +17,8 @@ from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.contradictions import contradicting_source
 from kcal.calibrate.rig.explanations import redundancy
 from kcal.calibrate.rig.initial_poses import first_poses
+from kcal.calibrate.rig.problem import RigSolution
 from kcal.calibrate.rig.resection import distinct_poses, poses_from_three
-from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.calibrate.rig.unknowns import held
 from kcal.lens import rotation_from_vector
 from kcal.report import rig_verdict

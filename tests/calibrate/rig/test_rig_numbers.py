@@ -29,7 +29,7 @@ from kcal.calibrate.rig.contradictions import Part, _test
 from kcal.calibrate.rig.explanations import least_redundancy, redundancy, refuse_exact
 from kcal.calibrate.rig.marks import Features, Landmarks
 from kcal.calibrate.rig.motion import CameraRows, summed_products
-from kcal.calibrate.rig.problem import RigProblem, _of_item, least
+from kcal.calibrate.rig.problem import RigProblem, RigSolution, _of_item, least
 from kcal.calibrate.rig.source import (
     Block,
     Context,
@@ -41,7 +41,6 @@ from kcal.calibrate.rig.source import (
     first_rays,
     typical_ratio,
 )
-from kcal.calibrate.rig.uncertainty import RigSolution
 from kcal.calibrate.rig.unknowns import _moving, held
 from kcal.checks import chi2_quantile
 from kcal.lens import vector_from_rotation
