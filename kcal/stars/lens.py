@@ -336,7 +336,7 @@ def calibrate_by_stars(
     order = sorted(range(len(images)), key=lambda number: -len(images[number].pixels))
     rotations: dict[int, np.ndarray] = {}
     if boards is None:
-        camera, rotations = _first_lens(images, views, order, size, focal, catalog, progress)
+        camera, rotations = _first_lens(images, views, order, _plain_cameras(size, focal), catalog, progress)
     else:
         camera = boards.camera
         if camera.size != size:
@@ -357,21 +357,21 @@ def calibrate_by_stars(
     lens: StarLens | None = None
     agreement: Agreement | None = None
     for _ in range(3):
-        fields, star, pixels, kept = _star_fields(images, views, camera, rotations, catalog)
-        turns = [rotation for _, rotation in kept]
+        seen = _star_fields(images, views, camera, rotations, catalog)
+        fields, turns = [one.field for one in seen.values()], [one.rotation for one in seen.values()]
         if boards is None:
             lens = fit_star_lens(fields, turns, size, float(camera.params[0]))
         else:
             lens, agreement = refine_by_stars(fields, turns, boards)
         camera = lens.camera
-        rotations = {n: found.numpy() for (n, _), found in zip(kept, lens.rotations, strict=True)}
+        rotations = {n: found.numpy() for n, found in zip(seen, lens.rotations, strict=True)}
         progress("lens")
     assert lens is not None
     return StarCamera(
         lens=lens,
-        images=tuple(n for n, _ in kept),
-        stars=tuple(star),
-        pixels=tuple(pixels),
+        images=tuple(seen),
+        stars=tuple(one.star for one in seen.values()),
+        pixels=tuple(one.field.pixels.numpy() for one in seen.values()),
         refused=refused,
         agreement=agreement,
         joint=None if boards is None or agreement is None else joint_calibration(boards, lens, agreement),
@@ -382,8 +382,7 @@ def _first_lens(
     images: Sequence[DetectedStars],
     views: Sequence[SkyView],
     order: Sequence[int],
-    size: tuple[int, int],
-    focal: float | None,
+    cameras: Sequence[Camera],
     catalog: StarCatalog,
     progress: Callable[[str], object],
 ) -> tuple[Camera, dict[int, np.ndarray]]:
@@ -392,7 +391,7 @@ def _first_lens(
     tries = [(_FEW_CORNERS, number) for number in order[:_TRIES]] + [(_MORE_CORNERS, number) for number in order[:1]]
     for count, (corners, number) in enumerate(tries, 1):
         what = f"search {count} of {len(tries)}: image {number + 1}"
-        found = _search(images[number], size, focal, corners, catalog, progress, what)
+        found = _search(images[number], cameras, corners, catalog, progress, what)
         if found is not None:
             named, camera = found
             return _from_middle_outward(images, views, camera, {number: named.rotation}, catalog)
@@ -414,24 +413,24 @@ def _plain_of(degrees: float, size: tuple[int, int]) -> Camera:
     return _plain_camera(half / (angle if wide else math.tan(angle)), size, "fisheye4" if wide else "pinhole")
 
 
+def _plain_cameras(size: tuple[int, int], focal: float | None) -> list[Camera]:
+    """Those to try: from wide to narrow, or about a known focal length."""
+    if focal is None:
+        count = round(math.log(_WIDEST / _NARROWEST) / math.log(_STEP))
+        return [_plain_of(_WIDEST * _STEP**-k, size) for k in range(count + 1)]
+    return [_plain_camera(focal * _STEP**k, size, kind) for kind in ("pinhole", "fisheye4") for k in (0, 1, -1, 2, -2)]
+
+
 def _search(
     found: DetectedStars,
-    size: tuple[int, int],
-    focal: float | None,
+    tried: Sequence[Camera],
     corners: int,
     catalog: StarCatalog,
     progress: Callable[[str], object],
     what: str,
 ) -> tuple[Identification, Camera] | None:
-    """Names of the stars in the middle of an image, and a plain camera, tried from wide to narrow."""
-    count = round(math.log(_WIDEST / _NARROWEST) / math.log(_STEP))
-    tried = (
-        [_plain_of(_WIDEST * _STEP**-k, size) for k in range(count + 1)]
-        if focal is None
-        else [
-            _plain_camera(focal * _STEP**k, size, model) for model in ("pinhole", "fisheye4") for k in (0, 1, -1, 2, -2)
-        ]
-    )
+    """Names of the stars in the middle of an image, and a plain camera, from the first of those tried that fits."""
+    size = tried[0].size
     center = np.array([(size[0] - 1) / 2, (size[1] - 1) / 2])
     away = np.linalg.norm(found.pixels - center, axis=1)
     for camera in tried:
@@ -476,10 +475,11 @@ def _from_middle_outward(
     size = camera.size
     for share in (0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.2) if camera.model.fisheye else (0.6, 0.8, 1.0, 1.2):
         near = {n: _near_middle(images[n], size, share) for n in rotations}
-        fields, _, _, kept = _star_fields(near, views, camera, rotations, catalog)
-        lens = fit_star_lens(fields, [rotation for _, rotation in kept], size, float(camera.params[0]))
+        seen = _star_fields(near, views, camera, rotations, catalog)
+        fields, turns = [one.field for one in seen.values()], [one.rotation for one in seen.values()]
+        lens = fit_star_lens(fields, turns, size, float(camera.params[0]))
         camera = lens.camera
-        rotations = {n: found.numpy() for (n, _), found in zip(kept, lens.rotations, strict=True)}
+        rotations = {n: found.numpy() for n, found in zip(seen, lens.rotations, strict=True)}
     return camera, rotations
 
 
@@ -489,15 +489,23 @@ def _near_middle(found: DetectedStars, size: tuple[int, int], share: float) -> D
     return found._replace(pixels=found.pixels[use], sigma=found.sigma[use], flux=found.flux[use])
 
 
+class _Seen(NamedTuple):
+    """The named stars of an image, their numbers (N,) in the catalogue, and the rotation from the stars' frame."""
+
+    field: StarField
+    star: np.ndarray
+    rotation: Tensor
+
+
 def _star_fields(
     images: Sequence[DetectedStars] | dict[int, DetectedStars],
     views: Sequence[SkyView],
     camera: Camera,
     rotations: dict[int, np.ndarray],
     catalog: StarCatalog,
-) -> tuple[list[StarField], list[np.ndarray], list[np.ndarray], list[tuple[int, Tensor]]]:
-    """Stars with names of each image whose attitude is roughly known, in its own frame."""
-    fields, stars, pixels, kept = [], [], [], []
+) -> dict[int, _Seen]:
+    """Stars with names of each image whose attitude is roughly known, in its own frame, by its number."""
+    seen = {}
     for number, rotation in sorted(rotations.items()):
         found, directions = images[number], _directions(views[number], catalog)
         # At another time the axes are the same, but aberration and refraction move stars by some seconds of arc.
@@ -506,17 +514,9 @@ def _star_fields(
         if best is None:
             continue
         use = best.star >= 0
-        fields.append(
-            StarField(
-                torch.from_numpy(directions[best.star[use]]),
-                torch.from_numpy(found.pixels[use]),
-                torch.from_numpy(found.sigma[use]),
-            )
-        )
-        stars.append(best.star[use])
-        pixels.append(found.pixels[use])
-        kept.append((number, best.rotation))
-    return fields, stars, pixels, kept
+        parts = directions[best.star[use]], found.pixels[use], found.sigma[use]
+        seen[number] = _Seen(StarField(*map(torch.from_numpy, parts)), best.star[use], best.rotation)
+    return seen
 
 
 def _directions(view: SkyView, catalog: StarCatalog) -> np.ndarray:

@@ -368,17 +368,16 @@ def name_stars(
     sky = fit_attitude(found.pixels, found.sigma, celestial, catalog.magnitude, camera, named.rotation)
     if sky is None:
         raise InputError("fewer than three stars stand alone; the attitude cannot be fitted")
-    if not view.on_earth:
-        return NamedStars(
-            detected=found, view=view, attitude=sky, directions=celestial, on_earth=False, covariance=sky.covariance,
-            warnings=(),
-        )  # fmt: skip
-    return _on_earth(found, view, catalog, camera, sky, celestial)
+    named_stars = NamedStars(
+        detected=found, view=view, attitude=sky, directions=celestial, on_earth=False, covariance=sky.covariance,
+        warnings=(),
+    )  # fmt: skip
+    return _on_earth(named_stars, catalog, camera) if view.on_earth else named_stars
 
 
-def _on_earth(
-    found: DetectedStars, view: SkyView, catalog: night_sky.StarCatalog, camera: Camera, sky: Attitude, celestial: Any
-) -> NamedStars:
+def _on_earth(among: NamedStars, catalog: night_sky.StarCatalog, camera: Camera) -> NamedStars:
+    """The same with the attitude on the Earth."""
+    found, view, sky = among.detected, among.view, among.attitude
     there = view.directions(catalog)
     index = sky.star[sky.star >= 0]
     low = there[index, 2] < math.sin(night_sky.LOWEST_ALTITUDE)
@@ -388,13 +387,10 @@ def _on_earth(
             f"the stars are named, but {below} of {len(index)} would stand below the horizon there and then: place or "
             "time is wrong; the attitude is that among the stars"
         )
-        return NamedStars(
-            detected=found, view=view, attitude=sky, directions=celestial, on_earth=False, covariance=sky.covariance,
-            warnings=(text,),
-        )  # fmt: skip
+        return dataclasses.replace(among, warnings=(text,))
     # Refraction near the horizon is not known well enough: lower stars are put where no camera sees a star.
     usable = np.where(there[:, 2:] > math.sin(night_sky.LOWEST_ALTITUDE), there, [0.0, 0.0, -1.0])
-    start = sky.rotation.numpy() @ turn_between(there[index], celestial[index])
+    start = sky.rotation.numpy() @ turn_between(there[index], among.directions[index])
     scale = float(camera.params[0])
     blurred = np.hypot(found.sigma, scale * float(night_sky.refraction_sigma(np.arcsin(there[index, 2])).mean()))
     on_ground = fit_attitude(found.pixels, blurred, usable, catalog.magnitude, camera, start)
@@ -415,10 +411,9 @@ def _on_earth(
     doubt = refraction_doubt(on_ground, sigma, torch.from_numpy(there[used]), torch.from_numpy(vacuum), camera)
     if doubt is not None:
         doubts.append(doubt)
-    return NamedStars(
-        detected=found, view=view, attitude=on_ground, directions=there, on_earth=True, covariance=covariance,
-        warnings=tuple(doubts),
-    )  # fmt: skip
+    return dataclasses.replace(
+        among, attitude=on_ground, directions=there, on_earth=True, covariance=covariance, warnings=tuple(doubts)
+    )
 
 
 def _by_clock(view: SkyView) -> Tensor:

@@ -93,7 +93,20 @@ def star_source(
     altitude = torch.arcsin(direction[:, 2].clamp(-1, 1)).numpy()
     sigma = torch.from_numpy(np.hypot(_CATALOG_SIGMA, refraction_sigma(np.nan_to_num(altitude, nan=1.0))))
     sigma[direction.isnan().any(-1)] = math.inf
-    effects = _effects(moments, len(cameras), rows, clock_sigma, drift_sigma, origin, catalog, on_earth=on_earth)
+    if origin is not None:
+        pole = torch.from_numpy(pole_in_enu(origin.lat))
+    else:
+        # In the first camera's frame, which is that of the rig; the pole of J2000 is near enough.
+        first = next((moment[0] for moment in moments if 0 in moment), None)
+        if first is None:
+            raise InputError("stars without a place on the Earth: images of the first camera are needed")
+        pole = first.attitude.rotation[:, 2]
+    # An hour later the sky has turned from east to west: against the axis that points north.
+    second = -EARTH_RATE * pole
+    nights = _nights(moments, rows) if drift_sigma > 0 else {}
+    effects = _clock_effects(second, len(cameras), nights, clock_sigma, drift_sigma)
+    if on_earth:
+        effects += _effects_on_earth(second, moments, rows, len(cameras), catalog)
     return StarSource(
         names=tuple(row.name for row in rows),
         pixels=torch.from_numpy(marks[..., :2].copy()),
@@ -205,31 +218,11 @@ def _nights(moments: Sequence[Moment], rows: Sequence[_Row]) -> dict[int, Tensor
     return found
 
 
-def _effects(
-    moments: Sequence[Moment],
-    cameras: int,
-    rows: Sequence[_Row],
-    clock_sigma: float,
-    drift_sigma: float,
-    origin: Origin | None,
-    catalog: StarCatalog,
-    *,
-    on_earth: bool,
+def _clock_effects(
+    second: Tensor, cameras: int, nights: Mapping[int, Tensor], clock_sigma: float, drift_sigma: float
 ) -> list[Effect]:
-    """Clocks against each other, the clock against UT1, and the air."""
-    some = next(iter(moments[0].values()))
-    if origin is not None:
-        pole = torch.from_numpy(pole_in_enu(origin.lat))
-    else:
-        # In the first camera's frame, which is that of the rig; the pole of J2000 is near enough.
-        first = next((moment[0] for moment in moments if 0 in moment), None)
-        if first is None:
-            raise InputError("stars without a place on the Earth: images of the first camera are needed")
-        pole = first.attitude.rotation[:, 2]
+    """Clocks against that of the first camera, whose turn of the sky in a second is given."""
     found = []
-    # An hour later the sky has turned from east to west: against the axis that points north.
-    second = -EARTH_RATE * pole
-    nights = _nights(moments, rows) if drift_sigma > 0 else {}
     for camera in range(1, cameras):
         turn, whose = torch.zeros(cameras, 3, dtype=torch.float64), f"the clock of camera {camera + 1}"
         turn[camera] = second
@@ -237,10 +230,15 @@ def _effects(
             found.append(Effect(name=f"{whose} against that of the first", turn=clock_sigma * turn))
         for number, hours in nights.items():
             found.append(Effect(name=f"drift of {whose}, night {number}", turn=drift_sigma * turn, factor=hours))
-    if not on_earth:
-        return found
-    turn = (some.view.clock_sigma * second).expand(cameras, 3)
-    found.append(Effect(name="the clocks against UT1", turn=turn))
+    return found
+
+
+def _effects_on_earth(
+    second: Tensor, moments: Sequence[Moment], rows: Sequence[_Row], cameras: int, catalog: StarCatalog
+) -> list[Effect]:
+    """The clock against UT1, and the air."""
+    some = next(iter(moments[0].values()))
+    found = [Effect(name="the clocks against UT1", turn=(some.view.clock_sigma * second).expand(cameras, 3))]
     shifts: dict[str, Tensor] = {}
     for number, moment in enumerate(moments):
         at = [k for k, row in enumerate(rows) if row.moment == number and row.star >= 0]

@@ -29,6 +29,7 @@ from kcal.stars.lens import (
     _by_camera,
     _directions,
     _near_middle,
+    _plain_cameras,
     _plain_of,
     _search,
     _star_noise,
@@ -412,7 +413,7 @@ class TestRoughLens:
     def test_names_and_scale_from_the_middle(self) -> None:
         """Of a focal length that is stated 2 % too short."""
         seen, index = self.seen()
-        found = _search(seen, self.SIZE, 900.0 / 1.02, *self.HOW)
+        found = _search(seen, _plain_cameras(self.SIZE, 900.0 / 1.02), *self.HOW)
         assert found is not None
         named, lens = found
         assert float(lens.focal[0]) == pytest.approx(900.0, rel=2e-3)
@@ -422,7 +423,7 @@ class TestRoughLens:
         away = np.linalg.norm(seen.pixels[known] - [479.5, 299.5], axis=1)
         assert away.max() < 0.25 * math.hypot(*self.SIZE)
         few = seen._replace(pixels=seen.pixels[:4])
-        assert _search(few, self.SIZE, 900.0, *self.HOW) is None
+        assert _search(few, _plain_cameras(self.SIZE, 900.0), *self.HOW) is None
 
     def test_names_by_a_camera(self) -> None:
         seen, index = self.seen()

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.result import HYBRID, NETWORK, CalibrationOptions, Progress
-from kcal.calibrate.hybrid.fitted_views import moving_residuals
-from kcal.calibrate.problem.views import Views, poses_under, whitening
+from kcal.calibrate.camera.trust import held_out_squares
+from kcal.calibrate.problem.views import Views, whitening
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
 from kcal.gaussian import triangular
@@ -25,7 +25,6 @@ from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel, radius_over_angle
 from kcal.lens.projection import FAR, project_components
 from kcal.lens.uncertainty import FIT_PX, fitted_errors, inverse_half, pixel_covariance
-from kcal.solve.lm import LMOptions
 from kcal.texts import brief, setting_text
 from kcal.threads import in_one_thread
 
@@ -484,7 +483,6 @@ def _own_name(camera: Camera, number: int) -> str:
 # board's poses are solved again; camera and board stay as fitted. Models are compared by paired differences over the
 # same groups, so that errors that all models share cancel.
 
-_POSES = LMOptions(max_iterations=60, tolerance=1e-12)
 # Blocks are runs of at least five views, at most twenty of them.
 _RUN, _MOST_BLOCKS = 5, 20
 
@@ -626,15 +624,7 @@ def compare_models(
             if covariances is not None and not weighted:
                 weights, weighted = whitening(covariances, 0.5 * found.rms**2), True
             test = Views(board_points=found.board_points, pixels=observations.pixels()[out], whitening=weights[out])
-            poses, by_view = poses_under(found.camera, test, _POSES)
-            by_view = torch.nan_to_num(2.0 * by_view, nan=math.inf)
-            if judge is not None and judge.readout is not None:
-                residuals = moving_residuals(
-                    found.camera, found.board_points, observations.pixels()[out], poses.rotation, poses.translation,
-                    judge.readout, judge.stillness,
-                )  # fmt: skip
-                white = torch.einsum("vnij,vnj->vni", weights[out], residuals)
-                by_view = torch.where(by_view.isfinite(), white.square().nansum((1, 2)), torch.inf)
+            by_view, _ = held_out_squares(found.camera, test, judge)
             for g in held:
                 costs[number, g] = by_view[[out.index(i) for i in members[g]]].sum()
     if not bool(costs.isfinite().any()) and failures:

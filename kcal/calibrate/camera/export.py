@@ -327,6 +327,11 @@ class _Fitted(NamedTuple):
     misfit: Misfit | None = None
     width: Tensor | None = None
 
+    @property
+    def rms(self) -> float:
+        """Of the misfit, pixels."""
+        return self.misfit.rms if self.misfit is not None else 0.0
+
 
 def _in_one_model(
     cameras: Sequence[Camera], exact: Sequence[Camera | None], name: str, model: str | None
@@ -340,17 +345,17 @@ def _in_one_model(
         return held, ()
     fits = [_fit_each(camera, name, model) for camera in cameras]
     alone = [
-        _Fitted(one) if one is not None else min(found.values(), key=_misfit_rms)
+        _Fitted(one) if one is not None else min(found.values(), key=lambda one: one.rms)
         for one, found in zip(exact, fits, strict=True)
     ]
     shared = [[found[kind] for found in fits] for kind in fits[0] if all(kind in found for found in fits)]
     chosen = min(shared, key=_squares, default=alone)
     return chosen, tuple(
-        f"{camera_name(camera, f'camera {number}')}: written as {one.camera.model} (RMS {_misfit_rms(one):.2g} px) so "
+        f"{camera_name(camera, f'camera {number}')}: written as {one.camera.model} (RMS {one.rms:.2g} px) so "
         f"that all cameras have one lens model; in a file of its own it is {own.camera.model} "
-        f"({f'RMS {_misfit_rms(own):.2g} px' if own.misfit else 'exact'})"
+        f"({f'RMS {own.rms:.2g} px' if own.misfit else 'exact'})"
         for number, (camera, one, own) in enumerate(zip(cameras, chosen, alone, strict=True), 1)
-        if _misfit_rms(one) > _misfit_rms(own)
+        if one.rms > own.rms
     )
 
 
@@ -379,12 +384,8 @@ def _in_model(camera: Camera, kind: LensModel, name: str) -> _Fitted:
     return _Fitted(fitted.camera, measured_misfit(camera, str(kind), fitted.camera.project_rays), fitted.width)
 
 
-def _misfit_rms(one: _Fitted) -> float:
-    return one.misfit.rms if one.misfit is not None else 0.0
-
-
-def _squares(found: Sequence[_Fitted]) -> float:
-    return sum(_misfit_rms(one) ** 2 for one in found)
+def _squares(found: Sequence[_Fitted | Misfit]) -> float:
+    return sum(one.rms**2 for one in found)
 
 
 def _nearest_foreign(
@@ -402,13 +403,9 @@ def _nearest_foreign(
             continue
         folds = [not bool(lens.unproject(camera.grid(33, 25).reshape(-1, 2))[1].all())
                  for camera, lens in zip(cameras, lenses, strict=True)]  # fmt: skip
-        if not any(folds) and (best is None or _all_squares(misfits) < _all_squares(best[1])):
+        if not any(folds) and (best is None or _squares(misfits) < _squares(best[1])):
             best = lenses, misfits
     return best
-
-
-def _all_squares(misfits: Sequence[Misfit]) -> float:
-    return sum(misfit.rms**2 for misfit in misfits)
 
 
 def _foreign_instead(lenses: Sequence[ForeignCamera], found: Sequence[_Fitted], misfits: Sequence[Misfit]) -> str:
@@ -417,7 +414,7 @@ def _foreign_instead(lenses: Sequence[ForeignCamera], found: Sequence[_Fitted], 
         f"{lens.name or f'camera {number}'} RMS {misfit.rms:.2g} px"
         for number, (lens, misfit) in enumerate(zip(lenses, misfits, strict=True), 1)
     )
-    most = max(map(_misfit_rms, found))
+    most = max(one.rms for one in found)
     return f"written as {lenses[0].kind} ({names}): in one model of kcal's that the format holds, up to {most:.2g} px"
 
 
@@ -459,10 +456,7 @@ def _write_splines(
             models.append(str(held.model))
             misfits.append(None)
             continue
-        columns, rows = _SPLINE_SAMPLES
-        width, height = camera.size
-        u, v = torch.linspace(-0.5, width - 0.5, columns), torch.linspace(-0.5, height - 0.5, rows)
-        pixels = torch.stack(torch.meshgrid(u.double(), v.double(), indexing="xy"), -1).reshape(-1, 2)
+        pixels = _edge_to_edge(camera, _SPLINE_SAMPLES).reshape(-1, 2)
         rays, valid = camera.unproject(pixels)
         grid, values = fit_spline(rays[valid].numpy(), pixels[valid].numpy(), camera.size)
 
@@ -528,18 +522,21 @@ class Misfit(PixelShift):
         return super().largest + sum(most) / 4.0
 
 
+def _edge_to_edge(camera: Camera, count: tuple[int, int]) -> Tensor:
+    """(rows, columns, 2) places from edge to edge: half a pixel beyond the centers of the outer pixels."""
+    u, v = (
+        torch.linspace(-0.5, side - 0.5, n, dtype=torch.float64) for side, n in zip(camera.size, count, strict=True)
+    )
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+
+
 def measured_misfit(camera: Camera, model: str, project: Callable[[Tensor], tuple[Tensor, Tensor]]) -> Misfit:
     """Compare what a camera sees with pixels and a mask that `project` returns for rays (N, 3).
 
     Raises:
         DegenerateError: rays of the camera without a pixel, because the other lens folds or ends.
     """
-    columns, rows = _DENSE
-    width, height = camera.size
-    # From edge to edge: half a pixel beyond the centers of the outer pixels.
-    u = torch.linspace(-0.5, width - 0.5, columns, dtype=torch.float64)
-    v = torch.linspace(-0.5, height - 0.5, rows, dtype=torch.float64)
-    pixels = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+    pixels = _edge_to_edge(camera, _DENSE)
     rays, valid = camera.unproject(pixels.reshape(-1, 2))
     if not bool(valid.any()):
         raise DegenerateError("this camera has no ray for any pixel")

@@ -250,7 +250,8 @@ def _compare(
     sums = torch.zeros(3, dtype=torch.float64)
     corners = 0
     for fitted, other in (results, results[::-1]):
-        squares, still = held_out_squares(fitted, seen_pixels(other))
+        views = Views(board_points=fitted.board_points, pixels=seen_pixels(other))
+        squares, still = held_out_squares(fitted.camera, views, fitted.hybrid)
         sums += torch.stack([squares.sum(), other.residuals.square().nansum(), still.sum()])
         corners += int(other.residuals[..., 0].isfinite().sum())
     held_out, own, still_rms = (sums / corners).sqrt().tolist()
@@ -278,19 +279,20 @@ def _plain_lens(
     return PlainLens(model, found.held_out, own)
 
 
-def held_out_squares(fitted: CameraCalibrationResult, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """(V,) squared residuals of held-out views (V, N, 2), with poses, and motions if there are any, solved again.
+def held_out_squares(camera: Camera, views: Views, judge: HybridFit | None) -> tuple[Tensor, Tensor]:
+    """(V,) squared residuals of held-out views, with poses, and motions as of the judge's views, solved again.
 
     Then with poses alone. Infinite where a view has no pose.
     """
-    poses, cost = poses_under(fitted.camera, Views(board_points=fitted.board_points, pixels=pixels), _POSES)
+    poses, cost = poses_under(camera, views, _POSES)
     squares = torch.nan_to_num(2.0 * cost, nan=math.inf)
-    fit = fitted.hybrid
-    if fit is None or fit.readout is None:
+    if judge is None or judge.readout is None:
         return squares, squares
     residuals = moving_residuals(
-        fitted.camera, fitted.board_points, pixels, poses.rotation, poses.translation, fit.readout, fit.stillness
+        camera, views.board_points, views.pixels, poses.rotation, poses.translation, judge.readout, judge.stillness
     )
+    if views.whitening is not None:
+        residuals = torch.einsum("vnij,vnj->vni", views.whitening, residuals)
     return torch.where(squares.isfinite(), residuals.square().nansum((1, 2)), torch.inf), squares
 
 
