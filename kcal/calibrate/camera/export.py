@@ -271,7 +271,7 @@ def export_cameras(
         other = _nearest_foreign(several, [model] if model else known.lenses)
         if other is None and model:
             raise InputError(f"the lens {model} does not show the whole image of this camera; choose another model")
-        if other is not None and (model or _all_squares(other[1]) < 0.25 * _squares(found)):
+        if other is not None and (model or _squares(other[1]) < 0.25 * _squares(found)):
             assert known.write is not None
             return ExportedCameras(
                 format=name,
