@@ -30,6 +30,7 @@ from kcal.calibrate.camera.warnings import spacing_findings, unit_findings
 from kcal.calibrate.hybrid.base_fit import may_be_unequal
 from kcal.calibrate.hybrid.board_modes import turned_corners
 from kcal.calibrate.hybrid.cameras_fit import LEAST_CAMERAS, Run, fit_cameras
+from kcal.calibrate.hybrid.fit import FitOptions
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError, KcalError
@@ -81,9 +82,8 @@ def sharing(
     alone = [result.hybrid.only(used[i]) for i, result in known.items() if result.hybrid is not None]
     fitted = fit_cameras(
         [result.observations.subset([result.observations.names[k] for k in used[i]]) for i, result in known.items()],
+        FitOptions(board=options.board),
         names=[str(i + 1) for i in known],
-        weights=[fit.weights for fit in alone],
-        board=options.board,
         one_type=one_type,
         first=alone,
         run=run,

@@ -29,7 +29,6 @@ from kcal.errors import InputError
 from kcal.gaussian import Gaussian, numbered, stacked
 from kcal.lens.information import BOARD_SLOT, LENS_SLOT
 from kcal.lens.model import HybridForm
-from kcal.lens.zernike import ZernikeModes
 from kcal.threads import in_one_thread
 
 # What cameras of one type have in common, learned from each other: first amplitudes, then the lens itself.
@@ -368,11 +367,9 @@ class CamerasFit:
 
 def fit_cameras(
     sets: Sequence[Observations],
+    options: FitOptions | None = None,
     *,
     names: Sequence[str] | None = None,
-    weights: Sequence[Tensor | None] | None = None,
-    modes: ZernikeModes | None = None,
-    board: Literal["printed", "exact"] | MeasuredBoard = "printed",
     one_type: bool = False,
     passes: int = 1,
     first: Sequence[HybridFit] | None = None,
@@ -383,13 +380,11 @@ def fit_cameras(
 
     Args:
         sets: observations of each camera.
+        options: of all fits; a board is as printers err, as it was ordered, or as was measured.
         names: of the observations; numbers from 1 if not given.
-        weights: (V, N) of each camera's corners; one if not given.
-        modes: of the fields.
-        board: how boards differ from the ones that were ordered: as printers err, not at all, or as was measured.
         one_type: the cameras are of one type: from four cameras on, each learns from the others what its lens is like.
         passes: how often the cameras are fitted again, with what the others tell, after they were fitted alone.
-        first: fits of each camera alone with these weights and this board, if there are any.
+        first: fits of each camera alone with these options, if there are any; their weights are kept.
         run: makes the fits of one pass, for example on other processes; one after the other if not given.
         advance: called with a text after each fit.
 
@@ -404,7 +399,9 @@ def fit_cameras(
     if one_type and len({seen.image_size for seen in sets}) > 1:
         raise InputError("cameras of one type have images of one size; these have several")
     names = names or [str(i + 1) for i in range(len(sets))]
-    weights = weights or [None] * len(sets)
+    weights = [fit.weights for fit in first] if first else [None] * len(sets)
+    options = options or FitOptions()
+    board = options.board
     known: BoardPrior | None = None
     if isinstance(board, MeasuredBoard):
         for seen in sets:
@@ -423,7 +420,7 @@ def fit_cameras(
         return found
 
     fleet = one_type and len(sets) >= LEAST_CAMERAS
-    own = FitOptions(modes=modes, board=alone)
+    own = dataclasses.replace(options, board=alone)
     begun = fit({i: (own, None, fleet, first[i] if first else None, True) for i in each})
     cameras = [begun[i] for i in each]
     fitted = [camera.turns for camera in cameras]
@@ -450,7 +447,7 @@ def fit_cameras(
             if fleet or shape is not alone:
                 # Views that were turned since, and lenses of another form, have other unknowns.
                 kept = lenses[i] is None and torch.equal(camera.turns, fitted[i])
-                own = FitOptions(modes=modes, board=shape, lens=lenses[i])
+                own = dataclasses.replace(options, board=shape, lens=lenses[i])
                 tasks[i] = own, camera.turns, fleet, camera.fit if kept else None, False
         for i, again in fit(tasks).items():
             fitted[i] = again.turns

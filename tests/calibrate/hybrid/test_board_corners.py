@@ -152,7 +152,7 @@ def shared() -> CamerasFit:
     pixels = [printed_views(camera(k), BOARD, off_by(points, PLANTED), 8, k, noise=NOISE, pupil=2e-3) for k in (1, 2)]
     # The second camera's were all read from the other end.
     pixels[1] = turned_corners(pixels[1], BOARD, torch.full((8,), 2))
-    return fit_cameras([observe(one, board=BOARD, size=SIZE) for one in pixels], modes=MODES)
+    return fit_cameras([observe(one, board=BOARD, size=SIZE) for one in pixels], FitOptions(modes=MODES))
 
 
 @pytest.mark.slow
@@ -179,7 +179,7 @@ def test_a_measured_board_brings_them() -> None:
     """A camera with five views of it, too few to find much of them, has them all."""
     (board,) = shared().boards
     new = printed_views(camera(3), BOARD, off_by(printed_points(BOARD, 3), PLANTED), 5, 9, noise=NOISE, pupil=2e-3)
-    own = fit_cameras([observe(new, board=BOARD, size=SIZE)], modes=MODES, board=board).cameras[0].fit
+    own = fit_cameras([observe(new, board=BOARD, size=SIZE)], FitOptions(modes=MODES, board=board)).cameras[0].fit
     assert board.corners is not None
     assert agreement(own.displaced, board.corners) > 0.9
     assert own.sigma < 1.2 * NOISE

@@ -59,7 +59,7 @@ PRINT = printed_points(BOARD, 3)
 @functools.cache
 def shared(passes: int) -> CamerasFit:
     sets = [seen_by(camera(1), PRINT, 9, 11), seen_by(camera(2), PRINT, 9, 12)]
-    return fit_cameras(sets, names=["left", "right"], modes=MODES, passes=passes)
+    return fit_cameras(sets, FitOptions(modes=MODES), names=["left", "right"], passes=passes)
 
 
 def test_a_shared_board_is_better_known() -> None:
@@ -71,7 +71,9 @@ def test_a_shared_board_is_better_known() -> None:
     (board,) = found.boards
     assert board.observations == ("left", "right")
     assert board.log_evidence > 500.0
-    alone = [fit_cameras([seen_by(camera(k), PRINT, 9, 10 + k)], modes=MODES).cameras[0].fit for k in (1, 2)]
+    alone = [
+        fit_cameras([seen_by(camera(k), PRINT, 9, 10 + k)], FitOptions(modes=MODES)).cameras[0].fit for k in (1, 2)
+    ]
     errors = [shape_error(fit.board_points, PRINT) for fit in alone]
     assert shape_error(board.points, PRINT) < 0.8 * math.sqrt(0.5 * sum(e * e for e in errors))
     for one, both in zip(alone, found.cameras, strict=True):
@@ -90,7 +92,7 @@ def test_a_second_pass_changes_little() -> None:
 
 def test_two_prints_are_two_boards() -> None:
     sets = [seen_by(camera(1), PRINT, 9, 11), seen_by(camera(2), printed_points(BOARD, 4), 9, 12)]
-    found = fit_cameras(sets, modes=MODES)
+    found = fit_cameras(sets, FitOptions(modes=MODES))
     assert [c.board for c in found.cameras] == [0, 1]
     assert [board.observations for board in found.boards] == [("1",), ("2",)]
     # The lab: 1,650 nats and more.
@@ -101,7 +103,7 @@ def test_turned_views_are_found_within_and_between_cameras() -> None:
     """The left camera read 4 of 9 views from the other end, the right one all but one."""
     left, right = (torch.tensor([2, 0, 2, 0, 2, 0, 0, 2, 0]), torch.tensor([2, 2, 2, 2, 0, 2, 2, 2, 2]))
     sets = [seen_by(camera(k), PRINT, 9, 10 + k, turns) for k, turns in ((1, left), (2, right))]
-    found = fit_cameras(sets, modes=MODES)
+    found = fit_cameras(sets, FitOptions(modes=MODES))
     assert [c.board for c in found.cameras] == [0, 0]
     ends = [(turns + c.turns) % 4 for turns, c in zip((left, right), found.cameras, strict=True)]
     # All read from one end: which one cannot be known.
@@ -137,11 +139,11 @@ def test_a_measured_board_helps_the_next_camera() -> None:
         errors.append([far_error(fit.camera, camera(seed)) for fit in fits])
     known, alone = torch.tensor(errors).square().mean(0).sqrt().tolist()
     assert known < 0.7 * alone
-    right = fit_cameras([seen], modes=MODES, board=board)
+    right = fit_cameras([seen], FitOptions(modes=MODES, board=board))
     assert right.boards == (board,)
     assert right.cameras[0].nats > 10.0
     wrong = seen_by(camera(23), printed_points(BOARD, 4), 5, 23)
-    assert fit_cameras([wrong], modes=MODES, board=board).cameras[0].nats < -100.0
+    assert fit_cameras([wrong], FitOptions(modes=MODES, board=board)).cameras[0].nats < -100.0
 
 
 @pytest.mark.slow
@@ -168,7 +170,7 @@ def test_a_fleet_knows_its_lens() -> None:
     """Five views of a camera whose type is known from five others, against five views alone."""
     flat = BOARD.points
     sets = [seen_by(camera(seed), flat, 8, seed) for seed in range(5)]
-    fleet = fit_cameras(sets, modes=MODES, board="exact", one_type=True)
+    fleet = fit_cameras(sets, FitOptions(modes=MODES, board="exact"), one_type=True)
     assert fleet.boards == ()
     # Focal lengths scatter by 10 px; five cameras say that coarsely.
     assert 5.0 < float(fleet.lens.unknowns.sd[0]) < 25.0
@@ -190,7 +192,7 @@ def test_bad_input() -> None:
     other = dataclasses.replace(shared(1).boards[0], board=Board(columns=8, rows=6, square=0.031))
     seen = seen_by(camera(1), PRINT, 5, 1)
     with pytest.raises(InputError, match="show another board"):
-        fit_cameras([seen], board=other)
+        fit_cameras([seen], FitOptions(board=other))
     with pytest.raises(InputError, match="one at least"):
         fit_cameras([seen], passes=0)
     with pytest.raises(InputError, match="one size"):
