@@ -15,7 +15,7 @@ from kcal.lens.projection import pupil_depth
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.calibration import board_figure
 from kcal.report.figures import ACCENT, frame_image, new_figure, save_picture
-from scripts.bench.one_camera import stereo_images
+from scripts.shared.real_captures import stereo_images
 from scripts.shared.wide_lens import load
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "explanation"
@@ -39,7 +39,7 @@ def main() -> None:
     left.set(xlabel="angle from the axis, degrees", ylabel="start of the ray, mm")
     left.set_title("Entrance pupil of a 150° lens, ± 2 σ", fontsize=10, loc="left")
 
-    sides = stereo_images()
+    sides = [stereo_images(side) for side in ("left", "right")]
     print(f"wrote {save_picture(FOLDER / 'board.png', board_figure(measure_board(sides, names=('left', 'right'))[0]))}")
     camera = calibrate_camera(sides[0]).camera
     sigma, places = image_sigma(camera, 65, 49), camera.grid(65, 49).numpy()

@@ -1,47 +1,141 @@
-"""Make sections of the measured pages anew.
+"""Make tables and pictures of the measured pages anew.
 
-    python -m scripts.measure rig locate --write     all sections of two pages that are functions with `section`
-    python -m scripts.measure --quick                of all pages, in little
-    python -m scripts.measure --list                 which there are
+    python -m scripts.measure rig                       all sections of docs/measured/rig.md, printed
+    python -m scripts.measure rig coverage --write      one of them, into its page
+    python -m scripts.measure rig --help                which there are, and their options
+    python -m scripts.measure --quick                   of all pages, in little: that they run, not what they find
 
-A script makes its own sections alone: `python -m scripts.check.rig --help`.
+What takes long is kept: `--out FILE` continues what FILE has, further files are read as well, and `--only-kept` makes
+nothing new. The comment below a table says the command, the commit, the machine and the versions. Real data are in the
+folder KCAL_DATA; what a machine lacks is named and left out.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
+import importlib.metadata
+import os
+import platform
 import re
+import shlex
+import subprocess
+import sys
 import time
 from pathlib import Path
+from typing import Any
 
-from scripts.shared.sections import SECTIONS, make
+from scripts.shared.page import DOCS, write_section
+from scripts.shared.sections import SECTIONS, Kept, Section, seeds
+from scripts.shared.timing import show
 
 ROOT = Path(__file__).parent
+# Packages whose versions change what is measured.
+_TOLD = ("torch", "numpy", "scipy", "opencv-contrib-python-headless", "kornia")
 
 
-def load() -> None:
-    """Import every script that has sections."""
+def load(page: str) -> list[Section]:
+    """Import every script that has sections of a page; they come in the page's order."""
     for path in sorted(ROOT.glob("*/*.py")):
-        if re.search(r"^@section\(", path.read_text(encoding="utf-8"), re.MULTILINE):
-            importlib.import_module(f"scripts.{path.parent.name}.{path.stem}")
+        if re.search(rf'^@?section\(\s*"{page}\.md"', path.read_text(encoding="utf-8"), re.MULTILINE):
+            try:
+                importlib.import_module(f"scripts.{path.parent.name}.{path.stem}")
+            except ImportError as error:
+                print(f"{path.stem}: left out, {error}", flush=True)
+    order = re.findall(r"<!-- begin: (.+) -->", (DOCS / f"{page}.md").read_text(encoding="utf-8"))
+    own = [each for each in SECTIONS if each.page == f"{page}.md"]
+    return sorted(own, key=lambda each: order.index(each.name) if each.name in order else len(order))
 
 
-def main() -> None:
+def _add_option(parser: argparse.ArgumentParser, name: str, default: Any) -> None:
+    option = f"--{name.replace('_', '-')}"
+    if isinstance(default, bool):
+        parser.add_argument(option, action="store_true", default=None)
+    elif isinstance(default, range):
+        parser.add_argument(option, type=seeds, help=f"for example 0-9; {default.start}-{default.stop - 1} if left out")
+    elif isinstance(default, tuple):
+        shown = " ".join(map(str, default))
+        parser.add_argument(option, type=type(default[0]), nargs="+", help=f"{shown} if left out")
+    else:
+        parser.add_argument(option, type=Path if default is None else type(default), help=f"{default} if left out")
+
+
+def make(each: Section, given: dict[str, Any], *, quick: bool, write: bool) -> None:
+    """Make one section, with what is given of its options; a quick one is not written."""
+    # Here, because help does not need them.
+    import cv2
+    import torch
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    print(f"{each.page}: {each.name}", flush=True)
+    start, write = time.process_time(), write and not quick
+    chosen = {name: value for name, value in given.items() if name in each.options and value is not None}
+    more = {"write": write} if "write" in each.options else {}
+    try:
+        lines = []
+        for line in each.make(**((each.quick if quick else {}) | chosen | more)) or ():
+            lines += show([line])
+    except (ImportError, SystemExit) as missing:
+        if isinstance(missing, SystemExit) and not isinstance(missing.code, str):
+            raise
+        print(f"left out, {missing}", flush=True)
+        return
+    if lines:
+        write_section(each.page, each.name, [*lines, "", _made(each, chosen)], write=write)
+    print(f"{time.process_time() - start:.1f} CPU s", flush=True)
+
+
+def _made(each: Section, chosen: dict[str, Any]) -> str:
+    """By what, from what and when a section was made; a comment of the page."""
+    words = [Path(each.page).stem, each.name]
+    for name, default in each.options.items():
+        value = chosen.get(name, default)
+        if value and name not in ("write", "kept"):
+            values = [f"{value.start}-{value.stop - 1}"] if isinstance(value, range) else value
+            several = isinstance(values, list | tuple)
+            words += [f"--{name.replace('_', '-')}", *([] if value is True else values if several else [values])]
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False).stdout
+    machine = platform.processor() or platform.machine()
+    with contextlib.suppress(OSError, AttributeError):
+        machine = re.search(r"model name\s*: (.+)", Path("/proc/cpuinfo").read_text())[1]  # type: ignore[index]
+    told = [f"python -m scripts.measure {shlex.join(map(str, words))}", time.strftime("%Y-%m-%d")]
+    told += [f"commit {commit.strip()}", f"{machine}, {os.cpu_count()} CPUs", f"Python {platform.python_version()}"]
+    told += [f"{name} {importlib.metadata.version(name)}" for name in _TOLD]
+    return f"<!-- {', '.join(told)} -->"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Read the command line: the page comes first, then its sections."""
+    words = sys.argv[1:] if arguments is None else arguments
+    known = sorted(path.stem for path in DOCS.glob("*.md"))
+    page = words[0] if words and not words[0].startswith("-") else ""
+    if page and page not in known:
+        raise SystemExit(f"{page!r} is no page; there are {', '.join(known)}")
+    own = [each for one in ([page] if page else known) for each in load(one)]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pages", nargs="*", help="names of docs/measured; all if none is given")
+    parser.add_argument("page", nargs="?", help=f"{', '.join(known)}; all if none is given")
+    names = [each.name for each in own] if page else []
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"{', '.join(names)}; all if none is given")
+    options = {name: default for each in own for name, default in each.options.items()} if page else {}
+    kept = "kept" in options
+    for name, default in options.items():
+        if name not in ("write", "kept"):
+            _add_option(parser, name, default)
+    if kept:
+        parser.add_argument("--out", nargs="+", type=Path, default=[], help="JSON lines of draws; continues the first")
+        parser.add_argument("--only-kept", action="store_true", help="make no draws beside those of --out")
     parser.add_argument("--quick", action="store_true", help="in little: that they run, not what they find")
-    parser.add_argument("--list", action="store_true", help="only name them")
     parser.add_argument("--write", action="store_true", help="write the sections into their pages")
-    given = parser.parse_args()
-    load()
-    for each in SECTIONS:
-        if not given.pages or Path(each.page).stem in given.pages:
-            print(f"{each.page}: {each.name}", flush=True)
-            if not given.list:
-                start = time.process_time()
-                make(each, {}, quick=given.quick, write=given.write)
-                print(f"{time.process_time() - start:.1f} CPU s", flush=True)
+    given = vars(parser.parse_args(words))
+    if unknown := set(given["sections"]) - set(names):
+        parser.error(f"{min(unknown)!r} is no section; there are {', '.join(names)}")
+    if kept:
+        given["kept"] = Kept(tuple(given.pop("out")), given.pop("only_kept"))
+    for each in own:
+        if not given["sections"] or each.name in given["sections"]:
+            make(each, given, quick=given["quick"], write=given["write"])
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from kcal.lens.camera import Camera
 from scripts.check import aspect, captures_that_move, ordinary
 from scripts.shared.held_out import held_out
 from scripts.shared.mrcal_camera import SplinedCamera
-from scripts.shared.records import finish, read, seeds
+from scripts.shared.sections import Kept, seeds
 from scripts.shared.simulated import BOARD, stretched
 
 
@@ -26,18 +26,23 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
         return {"value": 10 * seed}
 
     with pytest.raises(KeyboardInterrupt):
-        finish(out, [("x", seed) for seed in range(4)], work, str)
+        Kept((out,)).records([("x", seed) for seed in range(4)], work)
     done.append(-1)
-    records = finish(out, [("x", seed) for seed in range(4)], work, str)
+    records = Kept((out,)).records([("x", seed) for seed in range(4)], work)
     assert done == [0, 1, -1, 2, 3]
     assert [record["value"] for record in records] == [0, 10, 20, 30]
 
 
 def test_records_of_split_runs_count_once(tmp_path: Path) -> None:
-    paths = [tmp_path / name for name in ("a", "b", "missing")]
-    finish(paths[0], [(0,), (1,)], lambda seed: {"from": "a"}, str)
-    finish(paths[1], [(1,), (2,)], lambda seed: {"from": "b"}, str)
-    assert [(record["key"][0], record["from"]) for record in read(paths)] == [(0, "a"), (1, "a"), (2, "b")]
+    paths = tuple(tmp_path / name for name in ("a", "b", "missing"))
+    Kept(paths[:1]).records([(0,), (1,)], lambda seed: {"from": "a"})
+    Kept(paths[1:2]).records([(1,), (2,)], lambda seed: {"from": "b"})
+    found = Kept(paths, only=True).records([(3,)], lambda seed: {"from": "nowhere"})
+    assert [(record["key"][0], record["from"]) for record in found] == [(0, "a"), (1, "a"), (2, "b")]
+
+
+def test_without_a_file_records_are_what_a_file_would_give() -> None:
+    assert Kept().records([("x", 1)], lambda *key: {"pair": key}) == [{"key": ["x", 1], "pair": ["x", 1]}]
 
 
 def test_seeds_include_the_last() -> None:
@@ -107,14 +112,14 @@ def test_tables_count_what_was_refused_and_said() -> None:
         {"key": ["hand", 8, 2, "default"], "refused": "too few"},
         {"key": ["stand", 8, 2, "default"], "refused": "too few"},
     ]
-    rows = captures_that_move.lines(records)[2:]
+    rows = [*captures_that_move.lines(records)][2:]
     assert rows[0] == "| 8 | hand | default | 3 | 33.3 % | 90.0 ± 5.0 | 2.000 | 2.236 | 1.000 | 0 % | 0 % |"
     assert "100.0 %" in rows[1]
     said = [
         {"key": [1.01, k], "factor": 1.01, "aspect": 1.012, "hand": k == 0, "said": text}
         for k, text in enumerate(([], ["pixels are not square"], ["pixels are not square"]))
     ]
-    assert aspect.lines(said)[2:] == [
+    assert [*aspect.lines(said)][2:] == [
         "| 1.01 | by hand | 1 | 0 | 0.0 % | – |",
         "| 1.01 | on a stand | 2 | 2 | 100.0 % | 0.0020 |",
     ]

@@ -3,21 +3,14 @@
 Boards of 9x6 corners are seen through a distorting lens at tilts up to 45 degrees; light is blurred, vignetted, encoded
 with a gamma of 2.2, given noise, rounded and compressed as JPEG (quality 95). Refiners start 0.3 px from the truth;
 detectors start from nothing. Errors beyond 2 px count as lost and are shown as a share.
-
-    python -m scripts.bench.corners --quick
-    python -m scripts.bench.corners --write
-    KCAL_DATA=DATA python -m scripts.bench.corners --quick --real
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import get_args
 
 import cv2
@@ -26,16 +19,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal import Board, Camera, detect
+from kcal import Board, Camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.corners.grid import local_side
-from kcal.corners.images import expand_images
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import saddle
 from kcal.lens import rotation_from_vector
 from kcal.sim.captures import BoardSize, project_board
 from kcal.sim.scene import RenderOptions, render_light
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.real_captures import stereo_images
+from scripts.shared.sections import section
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 SQUARES, BLURS, NOISES = (8, 10, 20, 40), (0.5, 1.0, 2.0), (0, 2, 5)
@@ -154,22 +148,7 @@ def _lost(pixels: Tensor, truth: Tensor) -> Tensor:
     return torch.nan_to_num(pixels - truth, nan=1e3)
 
 
-def rms_table(cells: dict[tuple[int, float, float], dict[str, Errors]]) -> list[str]:
-    """RMS per axis of every method at the usual noise, then the predicted over the true standard deviation of erf."""
-    names = list(next(iter(cells.values())))
-    rows = []
-    for (square, blur, noise), cell in cells.items():
-        if noise != SHOWN:
-            continue
-        row = [str(square), f"{blur:g}"]
-        for errors in cell.values():
-            rms, _, _, lost, _ = errors.row()
-            row.append("lost" if math.isnan(rms) else f"{rms:.4f}" + (f" ({100 * lost:.1f} %)" if lost > 5e-4 else ""))
-        rows.append([*row, f"{cell['kcal erf'].row()[4]:.2f}"])
-    return table(["square", "blur", *names, "predicted/true σ"], rows)
-
-
-def summary(cells: dict[tuple[int, float, float], dict[str, Errors]]) -> str:
+def summary(cells: dict[tuple[int, float, int], dict[str, Errors]]) -> str:
     """What the table says of the erf fit, in a sentence or two."""
     ratios = {key: cell["kcal erf"].row()[4] for key, cell in cells.items()}
     noisy = [ratio for (_, _, noise), ratio in ratios.items() if noise > 0]
@@ -188,37 +167,33 @@ def summary(cells: dict[tuple[int, float, float], dict[str, Errors]]) -> str:
     )
 
 
-def print_real(folder: Path) -> None:
+@section("corners.md", "refinement", squares=(40,), boards=1)
+def refinement(squares: tuple[int, ...] = SQUARES, boards: int = 20) -> Iterator[str]:
+    """RMS per axis of every method at the usual noise, then the predicted over the true standard deviation of erf."""
+    places = itertools.product(squares, BLURS, NOISES)
+    cells = {place: run_cell(*place, boards) for place in places}
+    names = list(next(iter(cells.values())))
+    rows = []
+    for (square, blur, noise), cell in cells.items():
+        if noise == SHOWN:
+            shown = [errors.row() for errors in cell.values()]
+            lost = [f" ({100 * row[3]:.1f} %)" if 5e-4 < row[3] < 1 else "" for row in shown]
+            rms = [f"{row[0]:.4f}{more}".replace("nan", "lost") for row, more in zip(shown, lost, strict=True)]
+            rows.append([square, f"{blur:g}", *rms, f"{cell['kcal erf'].row()[4]:.2f}"])
+    yield from table(["square", "blur", *names, "predicted/true σ"], rows)
+    yield from ["", summary(cells)]
+
+
+@section("corners.md", "real", refinements=("saddle",))
+def real(refinements: tuple[Refinement, ...] = get_args(Refinement)) -> Iterator[str]:
     """RMS of a 5-coefficient calibration of OpenCV's sample images, all corners alike, for every refinement."""
-    for side in ("left", "right"):
-        paths = expand_images([str(folder / "opencv_stereo" / f"{side}*.jpg")])
-        for refine in get_args(Refinement):
-            seen = detect(paths, BOARD, refine)
-            result = calibrate_camera(seen, CalibrationOptions(weighted=False))
-            unseen = sum(view.pixels.count(None) for view in seen.views)
-            print(
-                f"{side} {refine}: {len(seen.views)} of {len(paths)} images, {unseen} corners rejected, "
-                f"RMS {result.rms:.4f} px, fx {float(result.camera.focal[0]):.2f} ± {result.sigma['fx']:.2f}"
-            )
 
+    def cell(side: str, refine: Refinement) -> str:
+        seen = stereo_images(side, refine)
+        result = calibrate_camera(seen, CalibrationOptions(weighted=False))
+        unseen = sum(view.pixels.count(None) for view in seen.views)
+        lost = f" ({unseen} of {BOARD.corners * len(seen.views)} corners rejected as glaring)" if unseen else ""
+        return f"{result.rms:.4f}{lost}"
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Accuracy of corner refinement.")
-    parser.add_argument("--quick", action="store_true", help="2 boards a cell instead of 20, without 8 px squares")
-    parser.add_argument("--write", action="store_true", help="write the table of docs/measured/corners.md")
-    parser.add_argument("--real", action="store_true", help="also calibrate the images in KCAL_DATA")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    squares, count = (SQUARES[1:], 2) if arguments.quick else (SQUARES, 20)
-    cells = {(s, b, n): run_cell(s, b, n, count) for s, b, n in itertools.product(squares, BLURS, NOISES)}
-    lines = [*rms_table(cells), "", summary(cells)]
-    tell("corners.md", "refinement", lines, write=arguments.write)
-    if arguments.real:
-        folder = os.environ.get("KCAL_DATA")
-        if not folder:
-            raise SystemExit("KCAL_DATA is not set: no real images")
-        print_real(Path(folder))
-
-
-if __name__ == "__main__":
-    main()
+    sides = ("left", "right")
+    return table(["refinement", *sides], ([refine, *(cell(side, refine) for side in sides)] for refine in refinements))

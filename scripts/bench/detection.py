@@ -1,17 +1,13 @@
-"""How fast boards are found and refined, alone and in batches: section "Speed" of docs/measured/corners.md.
+"""How fast boards are found and refined, alone and in batches.
 
 Detection and refinement apart, beside OpenCV's detectors, on rendered images of 12 megapixels and on the images in
 KCAL_DATA. Then `kcal batch` on N images of 12 megapixels: images a second and memory with one process and with two, and
 whether a run that is killed half way and continued gives the same table. A few images are rendered once; the N files
 are copies that differ in a comment, so that none is taken for another.
-
-    python -m scripts.bench.detection --images 20
-    KCAL_DATA=DATA python -m scripts.bench.detection --write
 """
 
 from __future__ import annotations
 
-import argparse
 import csv
 import os
 import signal
@@ -19,9 +15,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -35,12 +30,14 @@ from kcal.corners.images import expand_images, read_gray
 from kcal.corners.refine import refine_corners
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.scene import render_board
-from scripts.shared.page import table, write_section
+from scripts.bench.found import classic, sector
+from scripts.shared.page import table
+from scripts.shared.real_captures import data_folder
+from scripts.shared.sections import section
 
 BOARD = Board(columns=9, rows=6, square=0.025)
+SLOWEST = "findChessboardCornersSB"
 SLOW = 1  # image of 12 megapixels on which the sector detector is timed: minutes
-CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-SECTOR = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
 Image = NDArray[np.uint8]
 
 
@@ -55,23 +52,6 @@ def render(count: int) -> list[Image]:
     return [render_board(camera, pose, size, generator=generator).numpy() for pose in poses]
 
 
-def classic(image: Image) -> NDArray[Any] | None:
-    found, corners = cv2.findChessboardCorners(image, (BOARD.columns, BOARD.rows), flags=CLASSIC)
-    return corners if found else None
-
-
-def sector(image: Image) -> NDArray[Any] | None:
-    found, corners = cv2.findChessboardCornersSB(image, (BOARD.columns, BOARD.rows), flags=SECTOR)
-    return corners if found else None
-
-
-def opencv(image: Image) -> NDArray[Any] | None:
-    corners = classic(image)
-    if corners is None:
-        return None
-    return cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), (3, 100, 1e-4))
-
-
 def rate(images: list[Image], work: Callable[[Image], object | None]) -> tuple[float, int]:
     """Images a second, and how many gave something."""
     start = time.perf_counter()
@@ -79,7 +59,7 @@ def rate(images: list[Image], work: Callable[[Image], object | None]) -> tuple[f
     return len(images) / (time.perf_counter() - start), found
 
 
-def single(images: list[Image]) -> list[str]:
+def single(images: list[Image]) -> Iterator[list[str]]:
     """Rows of a table: images a second on one thread."""
     starts = {id(image): detect_board(image, BOARD, "none").pixels for image in images}
 
@@ -90,23 +70,21 @@ def single(images: list[Image]) -> list[str]:
         side = local_side(start, BOARD.columns, BOARD.rows)
         return refine_corners(image, start, side, "erf", (BOARD.columns, BOARD.rows))
 
+    search = sector()
     methods: dict[str, Callable[[Image], object | None]] = {
         "kcal, detection alone": lambda image: detect_board(image, BOARD, "none").pixels,
         "kcal, erf refinement alone": refine,
         "kcal, both": lambda image: detect_board(image, BOARD).pixels,
-        "findChessboardCorners": classic,
-        "findChessboardCorners and cornerSubPix 5": opencv,
-        "findChessboardCornersSB, exhaustive and accurate": sector,
+        "findChessboardCorners": lambda image: classic(image, BOARD, refine=False),
+        "findChessboardCorners and cornerSubPix 5": lambda image: classic(image, BOARD),
+        "findChessboardCornersSB, exhaustive and accurate": lambda image: search(image, BOARD),
     }
-    rows = []
     for name, work in methods.items():
-        some = images[:SLOW] if work is sector and images[0].size > 1e6 else images
-        if work is not sector:
+        some = images[:SLOW] if name.startswith(SLOWEST) and images[0].size > 1e6 else images
+        if not name.startswith(SLOWEST):
             work(some[0])  # what is loaded at the first call
         speed, found = rate(some, work)
-        rows.append(f"{name} | {speed:.3g} | {found} of {len(some)}")
-        print(rows[-1], flush=True)
-    return rows
+        yield [name, f"{speed:.3g}", f"{found} of {len(some)}"]
 
 
 def lay_out(folder: Path, images: list[Image], count: int) -> None:
@@ -168,54 +146,37 @@ def same_table(one: Path, two: Path) -> str:
     return f"a table whose numbers differ by {worst:.1e} at most, relatively"
 
 
-def batches(images: list[Image], count: int) -> list[str]:
+def batches(images: list[Image], count: int) -> Iterator[str]:
     """Sentences on batches of `count` images."""
-    lines = []
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
         lay_out(work / "images", images, count)
         seconds = {}
         for workers in (1, 2):
             seconds[workers], peak = run_batch(work / "images", work / f"out{workers}", workers)
-            lines.append(
+            yield (
                 f"* {workers} process{'es' * (workers > 1)}: {seconds[workers]:.1f} s, "
                 f"{count / seconds[workers]:.2f} images/s, at most {peak:.2f} GiB resident in all processes together."
             )
-            print(lines[-1], flush=True)
-        lines.append(f"* From 1 to 2 processes: {seconds[1] / seconds[2]:.2f} times as fast.")
+        yield f"* From 1 to 2 processes: {seconds[1] / seconds[2]:.2f} times as fast."
         run_batch(work / "images", work / "killed", 2, stop_at=max(1, count // 2))
         kept = len(list((work / "killed").glob(".work/*.json")))
         run_batch(work / "images", work / "killed", 2)
         verdict = same_table(work / "out2" / "summary.csv", work / "killed" / "summary.csv")
-        lines.append(f"* Killed after {kept} finished pieces and run again: {verdict}.")
-        print(*lines[-2:], sep="\n", flush=True)
-    return lines
+        yield f"* Killed after {kept} finished pieces and run again: {verdict}."
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Speed of detection, refinement and batches.")
-    parser.add_argument("--images", type=int, default=1000, help="images of 12 megapixels in the batch")
-    parser.add_argument("--rendered", type=int, default=10, help="of these so many are different")
-    parser.add_argument("--write", action="store_true", help="write the section of docs/measured/corners.md")
-    arguments = parser.parse_args()
+@section("corners.md", "speed", images=2, rendered=1)
+def speed(images: int = 1000, rendered: int = 10) -> Iterator[str]:
+    """Images of 12 megapixels in the batch, of which so many are different."""
     limit_threads(1)
-    images = render(arguments.rendered)
-    heads, rows = ["", "4000 x 3000, images/s", "found"], [row.split(" | ") for row in single(images)]
-    data = os.environ.get("KCAL_DATA")
-    if data:
-        real = [read_gray(path) for path in expand_images([str(Path(data) / "opencv_stereo" / "*.jpg")])]
-        eight_bits = [image.astype(np.uint8) for image in real]
+    made = render(rendered)
+    heads, rows = ["", "4000 x 3000, images/s", "found"], [*single(made)]
+    if "KCAL_DATA" in os.environ:
+        paths = expand_images([str(data_folder() / "opencv_stereo" / "*.jpg")])
+        real = single([read_gray(path).astype(np.uint8) for path in paths])
         heads += ["640 x 480, images/s", "found"]
-        rows = [[*row, *more.split(" | ")[1:]] for row, more in zip(rows, single(eight_bits), strict=True)]
-    text = [
-        *table(heads, rows),
-        "",
-        f"`kcal batch` on {arguments.images} JPEG files of 12 megapixels in folders of 100 a camera:",
-        "",
-    ]
-    text += batches(images, arguments.images)
-    write_section("corners.md", "speed", text, write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+        rows = [[*row, *more[1:]] for row, more in zip(rows, real, strict=True)]
+    yield from table(heads, rows)
+    yield from ["", f"`kcal batch` on {images} JPEG files of 12 megapixels in folders of 100 a camera:", ""]
+    yield from batches(made, images)

@@ -1,7 +1,5 @@
 """The default camera where a parametric model is exactly right: error at infinity over that model's.
 
-    python -m scripts.bench.exact_models [--seeds 200 201 202 203] [--write]    # into docs/measured/one-camera.md
-
 Truth: lenses with OpenCV's 5 or 14 coefficients, drawn at random about those of a surveillance camera, f 1600 px,
 1920 x 1080 px, without a moving pupil; views of an exact board with Gaussian noise. This is the worst case for a camera
 that knows no model. Both ways to take the board: unknown (the default; the right model with `board_warp`), and exact
@@ -10,10 +8,10 @@ that knows no model. Both ways to take the board: unknown (the default; the righ
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 import statistics
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -23,8 +21,8 @@ from kcal.lens.camera import Camera
 from kcal.sim.captures import board_points
 from scripts.shared.captures import PAPER_BOARD, capture_corners
 from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import table, tell
-from scripts.shared.timing import show
+from scripts.shared.page import table
+from scripts.shared.sections import section
 from scripts.shared.traced import BOARD, as_observations
 from scripts.shared.views import TRUTH
 
@@ -68,31 +66,18 @@ def errors(camera: Camera, views: int, noise: float, seed: int, model: str) -> l
         return [error_at_infinity(calibrate_camera(seen, one).camera, camera).rms for one in options]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[200, 201, 202, 203])
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+@section("one-camera.md", "exact-models", seeds=range(200, 201), views=(8,))
+def exact_models(seeds: range = range(200, 204), views: tuple[int, ...] = VIEWS) -> Iterator[str]:
     rows, ratios = [], []
-    for model, views, noise in itertools.product(MODELS, VIEWS, NOISE):
-        found = [errors(drawn(model, seed), views, noise, 1000 + seed, model) for seed in arguments.seeds]
+    for model, count, noise in itertools.product(MODELS, views, NOISE):
+        found = [errors(drawn(model, seed), count, noise, 1000 + seed, model) for seed in seeds]
         typical = [math.exp(statistics.fmean(map(math.log, column))) for column in zip(*found, strict=True)]
         ratios.append((typical[0] / typical[1], typical[2] / typical[3]))
-        rows.append([model, views, f"{noise:g}", *(f"{v:.3f}" for v in typical[:2]), f"{ratios[-1][0]:.2f}"])
-        show([" | ".join(map(str, rows[-1]))])
+        rows.append([model, count, f"{noise:g}", *(f"{v:.3f}" for v in typical[:2]), f"{ratios[-1][0]:.2f}"])
     unknown, exact = (
         f"geometric mean {math.exp(statistics.fmean(map(math.log, column))):.2f}, worst {max(column):.2f}"
         for column in zip(*ratios, strict=True)
     )
-    header = ["the lens is", "views", "noise", "default camera", "right model, warp", "ratio"]
-    lines = [
-        f"Default camera over the right model: {unknown}; both with the board taken as exact: {exact}.",
-        "",
-        *table(header, rows),
-    ]
-    tell("one-camera.md", "exact-models", lines, write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+    yield f"Default camera over the right model: {unknown}; both with the board taken as exact: {exact}."
+    yield ""
+    yield from table(["the lens is", "views", "noise", "default camera", "right model, warp", "ratio"], rows)

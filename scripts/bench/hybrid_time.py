@@ -1,17 +1,12 @@
 """Processor time and memory of the default camera, beside 14 coefficients, Ceres and mrcal's splines.
 
-    python -m scripts.bench.hybrid_time --write                          6 to 800 views; docs/measured/one-camera.md
-    KCAL_PEERS=/path/to/env/bin/python python -m scripts.bench.hybrid_time      Ceres too, from one with pyceres
-    KCAL_MRCAL=/usr/bin/python3 python -m scripts.bench.hybrid_time             mrcal too
-    python -m scripts.bench.hybrid_time --cameras 64 --views 30          many cameras: one call against single ones
-
-Views as in `scripts.bench.solver`: 6 x 7 corners, 0.2 px of noise. Each run is a process of its own, warmed up on eight
-views; runs alternate. Ceres begins at a good start that is not timed.
+KCAL_PEERS names an interpreter that has pyceres, KCAL_MRCAL one that has mrcal. Views as in `scripts.bench.solver`:
+6 x 7 corners, 0.2 px of noise. Each run is a process of its own, warmed up on eight views; runs alternate. Ceres begins
+at a good start that is not timed.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import statistics
@@ -19,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +24,8 @@ from kcal.corners.board import Board
 from scripts.bench import solver
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.mrcal_spline import splined
-from scripts.shared.page import table, tell
-from scripts.shared.timing import show
+from scripts.shared.page import table
+from scripts.shared.sections import section
 from scripts.shared.views import COLUMNS, ROWS, SIZE, SQUARE, observed, simulate
 
 SPLINE = "SPLINED13x9"
@@ -52,8 +48,9 @@ def work(way: str, views: int, cameras: int) -> None:
 
 
 def own(way: str, views: int, cameras: int = 1) -> dict[str, Any]:
-    command = [sys.executable, "-m", "scripts.bench.hybrid_time", "--work", way, str(views), str(cameras)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    code = f"from scripts.bench.hybrid_time import work; work({way!r}, {views}, {cameras})"
+    one_thread = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=one_thread)
     found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
     return found
 
@@ -98,37 +95,21 @@ def compare(views: int, repeats: int, timeout: float) -> list[Any]:
     return [*cells, f"{runs[DEFAULT][-1]['megabytes']:.0f} MB"]
 
 
-def main() -> None:
-    if sys.argv[1:2] == ["--work"]:
-        work(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
-        return
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--views", type=int, nargs="+", default=[6, 15, 30, 60, 200, 800])
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--timeout", type=float, default=120.0)
-    parser.add_argument("--cameras", type=int, help="only many cameras in one call, and in calls of their own")
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    os.environ["OMP_NUM_THREADS"] = "1"
-    if arguments.cameras:
-        rows = []
-        for way in (MANY, SINGLE):
-            found = own(way, arguments.views[0], arguments.cameras)
-            rows.append([way, f"{found['seconds']:.1f} s", f"{found['megabytes'] - found['before']:.0f} MB"])
-        lines = [f"{arguments.cameras} cameras of {arguments.views[0]} views each. One call also finds which of them "
-                 "saw one board.", "", *table(["way", "processor time", "memory, more than before"], rows)]  # fmt: skip
-        section = "many"
-    else:
-        header = ["views", DEFAULT, "14 coefficients, weak prior"]
-        header += ["Ceres, 14 coefficients"] if os.environ.get("KCAL_PEERS") else []
-        header += [f"mrcal, {SPLINE}"] if os.environ.get("KCAL_MRCAL") else []
-        rows = []
-        for views in arguments.views:
-            rows.append([str(cell) for cell in compare(views, arguments.repeats, arguments.timeout)])
-            show([" | ".join(rows[-1])])
-        lines, section = table([*header, "peak memory of the default"], rows), "time"
-    tell("one-camera.md", section, lines, write=arguments.write)
+@section("one-camera.md", "time", views=(6,), repeats=1)
+def time_of_fits(
+    views: tuple[int, ...] = (6, 15, 30, 60, 200, 800), repeats: int = 3, timeout: float = 120.0
+) -> Iterator[str]:
+    header = ["views", DEFAULT, "14 coefficients, weak prior"]
+    header += ["Ceres, 14 coefficients"] if os.environ.get("KCAL_PEERS") else []
+    header += [f"mrcal, {SPLINE}"] if os.environ.get("KCAL_MRCAL") else []
+    return table([*header, "peak memory of the default"], (compare(count, repeats, timeout) for count in views))
 
 
-if __name__ == "__main__":
-    main()
+@section("one-camera.md", "many", cameras=2, each=6)
+def many(cameras: int = 64, each: int = 30) -> Iterator[str]:
+    """Many cameras in one call, and in calls of their own."""
+    yield f"{cameras} cameras of {each} views each. One call also finds which of them saw one board."
+    yield ""
+    found = ((way, own(way, each, cameras)) for way in (MANY, SINGLE))
+    rows = ([way, f"{one['seconds']:.1f} s", f"{one['megabytes'] - one['before']:.0f} MB"] for way, one in found)
+    yield from table(["way", "processor time", "memory, more than before"], rows)

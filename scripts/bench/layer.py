@@ -1,14 +1,10 @@
-"""Gradients through a calibration: time, and what Gauss and Newton's matrix would get wrong; docs/measured/solver.md.
-
-python -m scripts.bench.layer          prints and writes the section
-python -m scripts.bench.layer --write    puts the table into the page
-"""
+"""Gradients through a calibration: time, and what Gauss and Newton's matrix would get wrong."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
@@ -17,8 +13,7 @@ from kcal.calibrate.camera.layer import CalibratedViews, calibrate_views
 from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.problem.board_problem import BoardProblem
 from scripts.shared.page import table
-from scripts.shared.sections import run, section
-from scripts.shared.timing import row
+from scripts.shared.sections import section
 from scripts.shared.views import MODELS, SIZE, simulate
 
 VIEWS, REPEATS, STEP = (30, 200, 800), 3, 1e-3
@@ -54,7 +49,7 @@ def linear_gradient(found: CalibratedViews, pixels: Tensor, board: Tensor, optio
     return (gradient / scale[0]).unflatten(0, (len(rows), 2, -1)).transpose(-1, -2)
 
 
-def study(views: int, lens: str) -> str:
+def study(views: int, lens: str) -> list[object]:
     """A row of the table."""
     drawn = simulate(views)
     board, pixels = torch.from_numpy(drawn["board"]), torch.from_numpy(drawn["pixels"])
@@ -81,15 +76,11 @@ def study(views: int, lens: str) -> str:
         timed(lambda: calibrate_views(again, board, SIZE, options, start=first)),
         timed(lambda: torch.autograd.grad(found.parameters[0], again, retain_graph=True)),
     )
-    return row(views, lens, *(f"{value:.3f}" for value in cells), f"{error:.1e}", linear)
+    return [views, lens, *(f"{value:.3f}" for value in cells), f"{error:.1e}", linear]
 
 
 @section("solver.md", "gradients", most=VIEWS[0])
-def gradients(most: int = VIEWS[-1]) -> list[str]:
+def gradients(most: int = VIEWS[-1]) -> Iterator[str]:
     heads = ["views", "lens", "from nothing, s", "again, s", "gradient, s", "error", "Gauss-Newton"]
     wanted = [(n, lens) for n in VIEWS if n <= most for lens in LENSES if lens != "default" or n <= MOST_DEFAULT]
-    return [*table(heads, []), *(study(n, lens) for n, lens in wanted)]
-
-
-if __name__ == "__main__":
-    run()
+    return table(heads, (study(n, lens) for n, lens in wanted))

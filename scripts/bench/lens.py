@@ -1,7 +1,5 @@
 """Points through the lens and back: kcal beside OpenCV and kornia, in speed, accuracy and honesty.
 
-    python -m scripts.bench.lens [--quick] [--write]
-
 Tables: throughput of project and unproject (100, 10 000 and 1 000 000 points, float64, one thread, eager and
 compiled; the hybrid camera beside opencv14), what the three answer where a pixel has no ray, and undistortion of 1080p
 images. Within a round every side runs once, in turn; ratios are taken within a round: medians, above 1
@@ -11,9 +9,8 @@ kcal is faster.
 from __future__ import annotations
 
 import itertools
-import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
@@ -24,11 +21,11 @@ from torch import Tensor
 from kcal.calibrate.hybrid.fit import fit_hybrid
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import Unproject
-from scripts.bench import undistort
 from scripts.shared import wide_lens
 from scripts.shared.distorted import distort
-from scripts.shared.sections import run, section
-from scripts.shared.timing import median, ratio, row, show, times
+from scripts.shared.page import table
+from scripts.shared.sections import section
+from scripts.shared.timing import median, ratio, times
 
 SIZE = (1920, 1080)
 # A barrel lens of 62 degrees across, every term of OpenCV's at work, and no fold in the image.
@@ -75,18 +72,15 @@ def peers_unproject(camera: Camera, pixels: Tensor) -> list[Call]:
     ]
 
 
-@torch.no_grad()
-def throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
+@section("lens.md", "speed", rounds=1, points=COUNTS[:1])
+def throughput(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[str]:
     """Rows of both directions."""
-    lines = show(
-        [
-            "| direction | coefficients | points | kcal eager | kcal compiled | OpenCV | kornia "
-            "| OpenCV / compiled | kornia / compiled |",
-            "|---|---|---|---|---|---|---|---|---|",
-        ]
-    )
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    heads = ["direction", "coefficients", "points", "kcal eager", "kcal compiled", "OpenCV", "kornia"]
+    return table([*heads, "OpenCV / compiled", "kornia / compiled"], _throughput(rounds, points))
+
+
+@torch.no_grad()
+def _throughput(rounds: int, counts: tuple[int, ...]) -> Iterator[list[object]]:
     for direction, model in itertools.product(("project", "unproject"), MODELS):
         torch.compiler.reset()
         camera = build(model)
@@ -101,26 +95,20 @@ def throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
             found = times(calls, rounds)
             rate = [median([1e-6 * count / s for s in side]) for side in found]
             faster = [ratio(found[1], found[other]) for other in (2, 3)]
-            lines += show([row(direction, len(MODELS[model]), f"{count:.0e}", *rate, *faster)])
-    return lines
+            yield [direction, len(MODELS[model]), f"{count:.0e}", *rate, *faster]
+
+
+@section("lens.md", "hybrid speed", rounds=1, points=COUNTS[:1])
+def hybrid_throughput(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[str]:
+    """Rows of both directions for the hybrid camera, beside 14 coefficients and OpenCV with these."""
+    heads = ["direction", "points", "hybrid", "first call, ms", "opencv14", "OpenCV", "OpenCV / hybrid"]
+    return table([*heads, "largest difference to the formulas, px"], _hybrid_throughput(rounds, points))
 
 
 @torch.no_grad()
-def hybrid_throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
-    """Rows of both directions for the hybrid camera, beside 14 coefficients and OpenCV with these."""
-    if "KCAL_DATA" not in os.environ:
-        return show(["Not measured: `KCAL_DATA` is not set."])
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+def _hybrid_throughput(rounds: int, counts: tuple[int, ...]) -> Iterator[list[object]]:
     seen, weights = wide_lens.load()
     fitted = fit_hybrid(seen.board.points, seen.pixels(), seen.image_size, torch.from_numpy(weights)).camera
-    lines = show(
-        [
-            "| direction | points | hybrid | first call, ms | opencv14 | OpenCV | OpenCV / hybrid "
-            "| largest difference to the formulas, px |",
-            "|---|---|---|---|---|---|---|---|",
-        ]
-    )
     plain = build("opencv14")
     for direction, count in itertools.product(("project", "unproject"), counts):
         # A new camera, so that its first call fits the polynomials.
@@ -139,32 +127,31 @@ def hybrid_throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
         first = f"{1e3 * (time.perf_counter() - start):.0f}"
         found = times(calls, rounds)
         rate = [median([1e-6 * count / s for s in side]) for side in found]
-        again = (
-            hybrid.project(points)[0] if direction == "project" else hybrid.project_rays(hybrid.unproject(pixels)[0])[0]
-        )
-        worst = f"{float((again - pixels).abs().max()):.1e}"
-        faster = ratio(found[0], found[2])
-        lines += show([row(direction, f"{count:.0e}", rate[0], first, *rate[1:], faster, worst)])
-    return lines
+        again = calls[0]()[0] if direction == "project" else hybrid.project_rays(calls[0]()[0])[0]  # type: ignore[index]
+        yield [
+            direction, f"{count:.0e}", rate[0], first, *rate[1:], ratio(found[0], found[2]),
+            f"{float((again - pixels).abs().max()):.1e}",
+        ]  # fmt: skip
 
 
+@section("lens.md", "accuracy")
 @torch.no_grad()
 def accuracy(count: int = 100_000) -> list[str]:
     """Largest error of each direction over the image, in pixels."""
-    lines = show(["| | kcal | OpenCV | kornia |", "|---|---|---|---|"])
     camera = build("opencv14")
     points = _points(camera, count)
     pixels, _ = camera.project(points)
     forward = [torch.as_tensor(np.asarray(call())).reshape(-1, 2) for call in peers_project(camera, points)]
     differences = [f"{float((other - pixels).abs().max()):.1e}" for other in forward]
-    lines += show([row("project, largest difference to kcal, px", "", *differences)])
     rays, valid = camera.unproject(pixels)
     found = [rays / rays[:, 2:]]
     for normalized in normalized_by_peers(camera, pixels):
         found.append(torch.cat([normalized, torch.ones(count, 1)], -1))
     errors = [float((camera.project(ray)[0] - pixels).norm(dim=-1).max()) for ray in found]
     assert bool(valid.all())
-    return lines + show([row("unproject, largest round trip, px", *(f"{e:.1e}" for e in errors))])
+    rows = [["project, largest difference to kcal, px", "", *differences],
+            ["unproject, largest round trip, px", *(f"{e:.1e}" for e in errors)]]  # fmt: skip
+    return [*table(["", "kcal", "OpenCV", "kornia"], rows)]
 
 
 def normalized_by_peers(camera: Camera, pixels: Tensor) -> list[Tensor]:
@@ -173,16 +160,10 @@ def normalized_by_peers(camera: Camera, pixels: Tensor) -> list[Tensor]:
     return [opencv, (kornias - camera.center) / camera.focal]
 
 
+@section("lens.md", "no ray")
 @torch.no_grad()
 def honesty() -> list[str]:
     """What each answers where iterations diverge, or no ray exists."""
-    lines = show(
-        [
-            "| pixel | kcal: ray's x / z, y / z | OpenCV (20, 1e-10) | round trip, px "
-            "| kornia, 20 iterations | round trip, px |",
-            "|---|---|---|---|---|---|",
-        ]
-    )
     strong = {"focal": (500, 500), "center": (1600, 1200), "size": (3201, 2401)}
     pincushion = Camera.build(**strong, coefficients=[0.5])  # type: ignore[arg-type]
     barrel = Camera.build(**strong, coefficients=[-0.5])  # type: ignore[arg-type]
@@ -193,14 +174,16 @@ def honesty() -> list[str]:
         ("3840x2160, corner without a preimage", corners, [0.0, 0.0]),
         ("3840x2160, the opposite corner", corners, [3839.0, 2159.0]),
     ]
+    rows = []
     for name, camera, pixel in cases:
         pixels = torch.tensor([pixel], dtype=torch.float64)
         rays, valid = camera.unproject(pixels)
         own, trip = _answer(rays[0, :2] / rays[0, 2], camera, pixels) if bool(valid) else ("**invalid**", "0")
         assert float(trip) < 1e-9
         cells = [_answer(normalized[0], camera, pixels) for normalized in normalized_by_peers(camera, pixels)]
-        lines += show([row(name, own, *itertools.chain(*cells))])
-    return lines
+        rows.append([name, own, *itertools.chain(*cells)])
+    heads = ["pixel", "kcal: ray's x / z, y / z", "OpenCV (20, 1e-10)", "round trip, px", "kornia, 20 iterations"]
+    return [*table([*heads, "round trip, px"], rows)]
 
 
 def _answer(normalized: Tensor, camera: Camera, pixels: Tensor) -> tuple[str, str]:
@@ -217,26 +200,3 @@ def _points(camera: Camera, count: int) -> Tensor:
     depth = 1 + 49 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
     rays, _ = camera.unproject(pixels)
     return rays / rays[:, 2:] * depth
-
-
-@section("lens.md", "speed", rounds=1, points=COUNTS[:1])
-def speed(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> list[str]:
-    return throughput(rounds, points)
-
-
-@section("lens.md", "hybrid speed", rounds=1, points=COUNTS[:1])
-def hybrid_speed(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> list[str]:
-    return hybrid_throughput(rounds, points)
-
-
-section("lens.md", "accuracy")(accuracy)
-section("lens.md", "no ray")(honesty)
-
-
-@section("lens.md", "images", rounds=1)
-def images(rounds: int = 30) -> list[str]:
-    return undistort.tables(rounds)
-
-
-if __name__ == "__main__":
-    run()

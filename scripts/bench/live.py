@@ -1,11 +1,7 @@
-"""`kcal live` for an hour: killed again and again, nothing lost, nothing doubled, memory flat; and what a track costs.
-
-python -m scripts.bench.live --hours 1 --rate 2 --targets 5 --kills 10 --write
-"""
+"""`kcal live` for an hour: killed again and again, nothing lost, nothing doubled, memory flat; what a track costs."""
 
 from __future__ import annotations
 
-import argparse
 import csv
 import os
 import random
@@ -14,6 +10,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +21,8 @@ from kcal import Localizer, Origin, Rig, save_rig
 from kcal.pipeline.pairing import ObjectViews
 from kcal.rig import Mounting, RigCovariance, planned_rig
 from kcal.track import Tracker
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.sections import section
 
 
 def site_rig() -> Rig:
@@ -83,21 +81,14 @@ def resident_mb(process: subprocess.Popen[bytes]) -> float:
     return int(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--hours", type=float, default=1.0)
-    parser.add_argument("--rate", type=float, default=2.0)
-    parser.add_argument("--targets", type=int, default=5)
-    parser.add_argument("--kills", type=int, default=10)
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+@section("tracks.md", "live", hours=0.003, kills=1)
+def live(hours: float = 1.0, rate: float = 2.0, targets: int = 5, kills: int = 10) -> Iterator[str]:
     costs = []
     for compiled in (False, True):
         cost_of_tracks(moments=12, compiled=compiled)
         costs.append([cost_of_tracks(compiled=compiled) for _ in range(5)])
         print(f"50 tracks{', compiled' if compiled else ''}: {np.median(costs[-1]):.2f} ms a moment", flush=True)
-    moments = round(options.hours * 3600 * options.rate)
+    moments = round(hours * 3600 * rate)
     with tempfile.TemporaryDirectory() as folder:
         rig, generator = site_rig(), torch.Generator().manual_seed(0)
         file, lines, output = (str(Path(folder, name)) for name in ("rig.json", "lines.jsonl", "tracks.csv"))
@@ -105,32 +96,32 @@ def main() -> None:
         malformed = 0
         with open(lines, "wb") as writer:
             for moment in range(moments):
-                left, right = marks(rig, options.targets, moment / options.rate, generator)
-                line = {"time": 1.7e9 + moment / options.rate, "left": left.tolist(), "right": right.tolist()}
+                left, right = marks(rig, targets, moment / rate, generator)
+                line = {"time": 1.7e9 + moment / rate, "left": left.tolist(), "right": right.tolist()}
                 writer.write(orjson.dumps(line | {"sigma": 0.2}) + b"\n")
                 if moment % 1000 == 500:
                     malformed += 1
                     writer.write(b'{"time": \n')
         command = [sys.executable, "-m", "kcal", "live", file, "--detections", lines, "-o", output]
-        chance, kills, memory = random.Random(0), 0, []
+        chance, killed, memory = random.Random(0), 0, []
         size = 0
         while True:
             process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
             # Killed after it has written a random share of what one of `kills` equal parts would be.
-            until = size + (0.5 + chance.random()) * 460.0 * options.targets * moments / (options.kills + 1)
+            until = size + (0.5 + chance.random()) * 460.0 * targets * moments / (kills + 1)
             while process.poll() is None:
                 time.sleep(0.05)
                 there = Path(output).stat().st_size if Path(output).exists() else 0
                 memory.append(resident_mb(process))
-                if kills < options.kills and there > until:
+                if killed < kills and there > until:
                     process.kill()
-                    kills += 1
+                    killed += 1
                     break
             process.wait()
             size = Path(output).stat().st_size
             if process.returncode == 0:
                 break
-            print(f"killed {kills} times, {size / 1e6:.1f} MB written", flush=True)
+            print(f"killed {killed} times, {size / 1e6:.1f} MB written", flush=True)
         with open(output, encoding="utf-8") as reader:
             seen = Counter((row["sequence"], row["name"]) for row in csv.DictReader(reader))
         sequences = {int(sequence) for sequence, _ in seen}
@@ -139,24 +130,17 @@ def main() -> None:
     settled = [value for value in memory if value > 0]
     quarter = max(1, len(settled) // 4)
     early, late = max(settled[: 2 * quarter]), max(settled[-quarter:])
-    text = "\n".join([
-        f"{options.hours:g} h of {options.rate:g} moments a second with {options.targets} targets, replayed as fast as "
-        "it goes. Made by `python -m scripts.bench.live --write`.",
-        "",
-        *table(["", "found"], [
-            ["moments, positions", f"{moments:,}, {sum(seen.values()):,}"],
-            ["malformed lines among them", malformed],
-            ["kills (SIGKILL)", kills],
-            ["moments lost", lost],
-            ["positions doubled", doubled],
-            ["most memory, first half and last quarter", f"{early:.0f} and {late:.0f} MB"],
-            ["50 tracks, one moment", share_of_core(costs[0])],
-            ["the same, compiled", share_of_core(costs[1])],
-        ]),
-    ])  # fmt: skip
-    print(text)
-    write_section("tracks.md", "live", text, write=options.write)
 
-
-if __name__ == "__main__":
-    main()
+    yield f"{hours:g} h of {rate:g} moments a second with {targets} targets, replayed as fast as it goes."
+    yield ""
+    rows: list[list[object]] = [
+        ["moments, positions", f"{moments:,}, {sum(seen.values()):,}"],
+        ["malformed lines among them", malformed],
+        ["kills (SIGKILL)", killed],
+        ["moments lost", lost],
+        ["positions doubled", doubled],
+        ["most memory, first half and last quarter", f"{early:.0f} and {late:.0f} MB"],
+        ["50 tracks, one moment", share_of_core(costs[0])],
+        ["the same, compiled", share_of_core(costs[1])],
+    ]
+    yield from table(["", "found"], rows)

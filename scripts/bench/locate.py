@@ -1,7 +1,5 @@
 """From pixels to positions, measured: speed beside OpenCV and kornia, coverage of the intervals, geodesy.
 
-    python -m scripts.bench.locate [--quick] [--write]
-
 Within a round every side runs once, in turn; ratios are taken within a round: medians, above 1 kcal is
 faster. The statistics are simulations with fixed seeds and do not depend on the machine.
 """
@@ -9,6 +7,7 @@ faster. The statistics are simulations with fixed seeds and do not depend on the
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -25,8 +24,9 @@ from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.localizer import Localizer
 from kcal.locate.tabulate import circular_error
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.sections import run, section
-from scripts.shared.timing import median, ratio, row, show, times
+from scripts.shared.page import table
+from scripts.shared.sections import section
+from scripts.shared.timing import median, ratio, times
 
 COUNTS = (100, 10_000, 1_000_000)
 
@@ -55,21 +55,16 @@ def sides(points: Tensor, sigma: float) -> Tensor:
     return seen[..., :2] / seen[..., 2:] + sigma / 1600 * noise
 
 
+@section("locate.md", "triangulation", rounds=1, points=COUNTS[:1])
 @torch.no_grad()
-def throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
-    lines = show(
-        [
-            "| points | kcal closed form | kcal compiled | OpenCV | kornia eigh | kornia cofactor "
-            "| OpenCV / closed | cofactor / closed |",
-            "|---|---|---|---|---|---|---|---|",
-        ]
-    )
+def triangulation(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[str]:
     cameras = poses()
     pose = cameras[1, :, :3].contiguous(), cameras[1, :, 3].contiguous()
     P = cameras.numpy()
     torch.compiler.reset()
     compiled = torch.compile(triangulate_pairs, fullgraph=True, dynamic=True)
-    for count in counts:
+    rows = []
+    for count in points:
         flat = sides(some_points(count), 0.1)
         rays = torch.cat([flat, torch.ones(count, 2, 1, dtype=torch.float64)], -1)
         left, right = rays[:, 0].contiguous(), rays[:, 1].contiguous()
@@ -84,21 +79,18 @@ def throughput(rounds: int, counts: tuple[int, ...]) -> list[str]:
         ]
         found = times(calls, rounds)
         rate = [median([1e-6 * count / s for s in side], 2) for side in found]
-        lines += show([row(f"{count:.0e}", *rate, ratio(found[0], found[2]), ratio(found[0], found[4]))])
-    return lines
+        rows.append([f"{count:.0e}", *rate, ratio(found[0], found[2]), ratio(found[0], found[4])])
+    heads = ["points", "kcal closed form", "kcal compiled", "OpenCV", "kornia eigh", "kornia cofactor"]
+    return table([*heads, "OpenCV / closed", "cofactor / closed"], rows)
 
 
+@section("locate.md", "accuracy")
 @torch.no_grad()
-def accuracy(count: int = 100_000) -> list[str]:
-    lines = show(
-        [
-            "| at 5 km | kcal closed form | kcal singular values | OpenCV | kornia eigh | kornia cofactor |",
-            "|---|---|---|---|---|---|",
-        ]
-    )
+def accuracy(count: int = 100_000) -> Iterator[str]:
     cameras = poses()
     P = cameras.numpy()
     point = torch.tensor([[300.0, -100.0, 5000.0]], dtype=torch.float64).expand(count, 3)
+    rows = []
     for name, sigma in (("0.1 px of noise: RMS error, m", 0.1), ("no noise: largest error, m", 0.0)):
         flat = sides(point, sigma)
         rays = torch.cat([flat, torch.ones(count, 2, 1, dtype=torch.float64)], -1)
@@ -113,8 +105,10 @@ def accuracy(count: int = 100_000) -> list[str]:
         ]
         errors = [torch.linalg.vector_norm(each - point, dim=-1) for each in found]
         cells = [f"{float(e.square().mean().sqrt()):.4f}" if sigma else f"{float(e.max()):.1e}" for e in errors]
-        lines += show([row(name, *cells)])
-    return lines
+        rows.append([name, *cells])
+    heads = ["at 5 km", "kcal closed form", "kcal singular values", "OpenCV", "kornia eigh", "kornia cofactor"]
+    yield from table(heads, rows)
+    yield from ["", geodesy()]
 
 
 def known_to() -> RigCovariance:
@@ -124,17 +118,13 @@ def known_to() -> RigCovariance:
     return RigCovariance.of(rig(), left=torch.diag(camera**2), right=torch.diag(camera**2), pose=torch.diag(pose**2))
 
 
+@section("locate.md", "localizer", rounds=1, points=COUNTS[:1])
 @torch.no_grad()
-def localizer(rounds: int, counts: tuple[int, ...]) -> list[str]:
-    lines = show(
-        [
-            "| points | marks' noise given once | a 4x4 covariance a point | with the calibration's covariance |",
-            "|---|---|---|---|",
-        ]
-    )
+def localizer(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[str]:
     plain = Localizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1)
     known = Localizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1, calibration=known_to())
-    for count in counts:
+    rows = []
+    for count in points:
         left, right = rig()(some_points(count))[0].unbind(-2)
         cov = (0.01 * torch.eye(4, dtype=torch.float64)).expand(count, 4, 4)
         found = times(
@@ -142,24 +132,20 @@ def localizer(rounds: int, counts: tuple[int, ...]) -> list[str]:
             rounds,
         )
         rate = [median([1e-6 * count / s for s in side], 3) for side in found]
-        lines += show([row(f"{count:.0e}", *rate)])
-    return lines
+        rows.append([f"{count:.0e}", *rate])
+    heads = ["points", "marks' noise given once", "a 4x4 covariance a point", "with the calibration's covariance"]
+    return table(heads, rows)
 
 
+@section("locate.md", "coverage", draws=400)
 @torch.no_grad()
-def coverage(draws: int) -> list[str]:
+def coverage(draws: int = 40_000) -> Iterator[str]:
     """Simulated marks, and rigs drawn from their own covariance, at seven ranges."""
-    lines = show(
-        [
-            "| range, m | marks only: interval | CEP50 | CEP95 | RMS of range / bound | with calibration: interval "
-            "| interval of marks alone, same rigs |",
-            "|---|---|---|---|---|---|---|",
-        ]
-    )
     there, known = rig(), known_to()
     plain = Localizer(there, origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1)
     wide = Localizer(there, origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1, calibration=known)
     factor, generator = known.half.T, torch.Generator().manual_seed(7)
+    rows = []
     for i, distance in enumerate(RANGES):
         angle = -0.3 + 0.1 * i
         point = distance * torch.tensor([[math.sin(angle), 0.02 * i - 0.06, math.cos(angle)]], dtype=torch.float64)
@@ -183,16 +169,13 @@ def coverage(draws: int) -> list[str]:
         for module in (wide, plain):
             answer = module(noisy[:, :2], noisy[:, 2:])
             shares.append(((answer.range_low <= distance) & (distance <= answer.range_high)).double().mean().item())
-        lines += show(
-            [
-                row(
-                    f"{distance:.0f}", f"{100 * inside.double().mean().item():.2f} %",
-                    *(f"{100 * share:.1f} %" for share in circles), f"{range_rms / bound:.3f}",
-                    *(f"{100 * share:.2f} %" for share in shares),
-                )
-            ]
-        )  # fmt: skip
-    return lines
+        rows.append([
+            f"{distance:.0f}", f"{100 * inside.double().mean().item():.2f} %",
+            *(f"{100 * share:.1f} %" for share in circles), f"{range_rms / bound:.3f}",
+            *(f"{100 * share:.2f} %" for share in shares),
+        ])  # fmt: skip
+    heads = ["range, m", "marks only: interval", "CEP50", "CEP95", "RMS of range / bound"]
+    return table([*heads, "with calibration: interval", "interval of marks alone, same rigs"], rows)
 
 
 def _marks_of_drawn_rigs(there: Rig, point: Tensor, factor: Tensor, draws: int, generator: torch.Generator) -> Tensor:
@@ -210,7 +193,7 @@ def _marks_of_drawn_rigs(there: Rig, point: Tensor, factor: Tensor, draws: int, 
     return torch.cat(pixels, -1)
 
 
-def geodesy() -> list[str]:
+def geodesy() -> str:
     worst = 0.0
     for lat in (-85.0, -45.0, 0.0, 19.07, 60.0, 85.0):
         for lon in (-180.0, -179.999, 0.0, 72.87, 179.999):
@@ -225,33 +208,7 @@ def geodesy() -> list[str]:
                 lats, lons, heights = enu_to_geodetic(enu, Origin(lat=lat, lon=lon, height=120.0)).numpy().T
                 back = np.stack(pipeline.transform(lons, lats, heights), -1)
                 worst = max(worst, float(np.abs(back - enu.numpy()).max()))
-    return show(
-        [
-            "ENU to latitude, longitude, height by kcal and back by PROJ: largest difference "
-            f"{worst:.1e} m (0 to 10 km, 360 azimuths, -85° to 85°, at and beside the antimeridian)."
-        ]
+    return (
+        "ENU to latitude, longitude, height by kcal and back by PROJ: largest difference "
+        f"{worst:.1e} m (0 to 10 km, 360 azimuths, -85° to 85°, at and beside the antimeridian)."
     )
-
-
-@section("locate.md", "coverage", draws=400)
-def covered(draws: int = 40_000) -> list[str]:
-    return coverage(draws)
-
-
-@section("locate.md", "triangulation", rounds=1, points=COUNTS[:1])
-def triangulation(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> list[str]:
-    return throughput(rounds, points)
-
-
-@section("locate.md", "accuracy")
-def accurate() -> list[str]:
-    return [*accuracy(), "", *geodesy()]
-
-
-@section("locate.md", "localizer", rounds=1, points=COUNTS[:1])
-def localizers(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> list[str]:
-    return localizer(rounds, points)
-
-
-if __name__ == "__main__":
-    run()

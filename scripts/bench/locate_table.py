@@ -1,19 +1,16 @@
 """`kcal locate` on long tables, measured: rows per second of processor time, and peak memory, for each format.
 
-    python -m scripts.bench.locate_table [--rows 1000 10000 ...] [--repeat 3] [--source FOLDER] [--write]
-
 Each run is a process of its own with one thread, which locates a table of one row first. Processor time (user and
-system), not time of day, so that other work on the machine counts less. Of several runs the fastest counts. `--source`
-measures another copy of kcal, for example an earlier version.
+system), not time of day, so that other work on the machine counts less. Of several runs the fastest counts.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -23,7 +20,8 @@ from kcal import save_rig
 from kcal.rig import Mounting, mounting_covariance
 from scripts.bench.locate import known_to, some_points
 from scripts.shared.long_range import ORIGIN, rig
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.sections import section
 
 COUNTS = (1_000, 1_000_000)
 SUFFIXES = ("csv", "geojson", "geojsonl", "kml", "cot")
@@ -69,8 +67,9 @@ def run(source: Path, *arguments: Path) -> tuple[float, float]:
     return float(found[0][1]), int(found[0][2]) / 1024.0
 
 
-def measure(source: Path, folder: Path, suffixes: tuple[str, ...], counts: list[int], repeat: int) -> list[str]:
-    """Rows of the page's table: each format with each rig."""
+def _rows(
+    source: Path, folder: Path, suffixes: tuple[str, ...], counts: tuple[int, ...], repeat: int
+) -> Iterator[list[str]]:
     exact, known = rig(), rig()
     exact.mounting = Mounting(origin=ORIGIN, heading_deg=35.0)
     known.mounting = Mounting(
@@ -79,7 +78,6 @@ def measure(source: Path, folder: Path, suffixes: tuple[str, ...], counts: list[
     known.covariance = known_to()
     rigs = {"exact": save_rig(exact, folder / "exact.json"), "with covariances": save_rig(known, folder / "known.json")}
     tables = {count: write_table(folder / f"{count}.csv", count) for count in [1, *counts]}
-    lines = []
     for suffix in suffixes:
         for name, path in rigs.items():
             if name != "exact" and suffix not in ("csv", "geojson"):
@@ -88,26 +86,15 @@ def measure(source: Path, folder: Path, suffixes: tuple[str, ...], counts: list[
             for count in counts:
                 found = [run(source, path, tables[1], tables[count], out) for _ in range(repeat)]
                 seconds, peak = min(each[0] for each in found), max(each[1] for each in found)
-                size = out.stat().st_size / 2**20
-                cells = [f".{suffix}", name, f"{count:,}", f"{count / seconds:,.0f}", f"{peak:.0f}"]
-                print(*cells, f"{size:.1f} MB", f"{1e6 * seconds / count:.1f} us a row", sep="  ", flush=True)
-                lines.append(cells)
+                yield [f".{suffix}", name, f"{count:,}", f"{count / seconds:,.0f}", f"{peak:.0f}"]
                 out.unlink()
-    return table(["file", "rig", "rows", "rows a second of processor time", "peak MB"], lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rows", type=int, nargs="+", default=list(COUNTS))
-    parser.add_argument("--formats", nargs="+", default=list(SUFFIXES))
-    parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--source", type=Path, default=Path(kcal.__file__).parents[1])
-    parser.add_argument("--write", action="store_true", help="write the table of docs/measured/locate.md")
-    arguments = parser.parse_args()
+@section("locate.md", "tables", rows=(1000,), formats=("csv",), repeat=1)
+def tables(
+    rows: tuple[int, ...] = COUNTS, formats: tuple[str, ...] = SUFFIXES, repeat: int = 3, source: Path | None = None
+) -> Iterator[str]:
+    """Each format with each rig; `source` measures another copy of kcal, for example an earlier version."""
     with tempfile.TemporaryDirectory() as name:
-        lines = measure(arguments.source, Path(name), tuple(arguments.formats), arguments.rows, arguments.repeat)
-    tell("locate.md", "tables", lines, write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+        made = _rows(source or Path(kcal.__file__).parents[1], Path(name), formats, rows, repeat)
+        yield from table(["file", "rig", "rows", "rows a second of processor time", "peak MB"], made)

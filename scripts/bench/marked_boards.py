@@ -1,17 +1,14 @@
-"""Boards with markers, found under hard conditions: section "Boards with markers" of docs/measured/corners.md.
+"""Boards with markers, found under hard conditions.
 
 kcal beside OpenCV's ArUco module and AprilTag's own library (`marker_peers`), on rendered ChArUco boards and Kalibr's
 AprilGrid in the scenes of `hard_boards`. An image is found if 6 corners are right, as many as a pose needs. A corner is
 wrong if it is more than 2 px from the truth, or where no corner is visible. RMS is over the others.
-
-    python -m scripts.bench.marked_boards --write
 """
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import cv2
 import numpy as np
@@ -46,7 +43,8 @@ from scripts.bench.marker_peers import (
     charuco_of_apriltag,
     kalibr_grid,
 )
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.sections import section
 
 WRONG = 2.0  # pixels
 KINDS = (plain, blurred, moving, overexposed, noisy, small, cut, covered, glaring, shaded)
@@ -96,27 +94,18 @@ def score(find: Detector, images: Iterable[Picture], board: Board) -> str:
     return ", ".join([*parts, f"{seconds / count:.2f} s"])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Boards with markers under hard conditions.")
-    parser.add_argument("--images", type=int, default=10, help="rendered images of each kind")
-    parser.add_argument("--write", action="store_true", help="write the section of docs/measured/corners.md")
-    arguments = parser.parse_args()
+@section("corners.md", "marked boards", images=1, kinds=1)
+def marked_boards(images: int = 10, kinds: int = len(KINDS)) -> Iterator[str]:
+    """Rendered images of each kind."""
     limit_threads(1)
-    text = []
     if not HAS_APRILTAG:
-        missing = "AprilTag's own library is left out: `pip install --target DIR pupil-apriltags`, DIR in PYTHONPATH."
-        print(missing)
-        text += ["", missing]
+        yield "AprilTag's own library is left out: `pip install --target DIR pupil-apriltags`, DIR in PYTHONPATH."
     for name, detectors in BOARDS:
         board = Board.parse(name, "30mm")
-        scene, rows = Marked(board), []
-        for kind in KINDS:
-            some = list(pictures(kind, arguments.images, scene))
-            rows.append([kind.__name__, *(score(find, some, board) for find in detectors.values())])
-            print(name, *rows[-1], sep=" | ", flush=True)
-        text += ["", f"`{name}`:", "", *table(["", *detectors], rows)]
-    write_section("corners.md", "marked boards", text, write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+        scene = Marked(board)
+        rows = (
+            [kind.__name__, *(score(find, pictures(kind, images, scene), board) for find in detectors.values())]
+            for kind in KINDS[:kinds]
+        )
+        yield from ["", f"`{name}`:", ""]
+        yield from table(["", *detectors], rows)

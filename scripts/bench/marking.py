@@ -1,7 +1,5 @@
 """How long `kcal mark` takes to start and for each moved mark, with two cameras of the default lens; CPU seconds.
 
-    python -m scripts.bench.marking [--marks 12] [--moves 12]
-
 Both cameras are calibrated from simulated captures, so that their calibrations bring a whole posterior, and a rig is
 solved from landmarks. Then one landmark after the other is moved by a tenth of a pixel, as by an arrow key: the rig is
 solved anew, with what its ranges and its epipolar curves are worth. With --cameras its lenses are refined each time;
@@ -10,7 +8,6 @@ with --rig they stay as they are.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import os
 import subprocess
@@ -33,6 +30,8 @@ from kcal.mark.items import SIDES, Mark, Put
 from kcal.mark.marking_service import Desk, solve_live
 from kcal.mark.session import Session
 from kcal.rig import Survey
+from scripts.shared.page import table
+from scripts.shared.sections import section
 from scripts.shared.simulated import simulated
 
 # Of captures by a machine-vision lens.
@@ -120,8 +119,8 @@ def timed(work: Callable[[], object]) -> float:
     return time.process_time() - start
 
 
-def report(desk: Desk, marks: Marks, moves: int, by: str) -> None:
-    """Mark all landmarks, move some of them, and print what that took."""
+def report(desk: Desk, marks: Marks, moves: int) -> float:
+    """Mark all landmarks, move some of them, and tell what each took, CPU seconds."""
 
     def put(row: int, side: int, shift: float) -> None:
         u, v = marks.pixels[row, side].tolist()
@@ -143,28 +142,19 @@ def report(desk: Desk, marks: Marks, moves: int, by: str) -> None:
         put(row, 1, 0.0)
     while desk.state()["pending"]:
         time.sleep(0.02)
-    each = [timed(functools.partial(moved, row)) for row in range(moves)]
-    curves = [timed(functools.partial(curve, row)) for row in range(moves)]
-    print(
-        f"--{by}: each moved mark {np.median(each):.2f} CPU s (at most {max(each):.2f}), of which the epipolar curve "
-        f"with its band {np.median(curves):.3f}; {desk.state()['rig']['text']}"
-    )
+    return float(np.median([timed(functools.partial(moved, row)) for row in range(moves)]))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--marks", type=int, default=12, help="landmarks")
-    parser.add_argument("--moves", type=int, default=12, help="how many of them are moved")
-    options = parser.parse_args()
+@section("marking.md", "time", landmarks=6, moves=1)
+def moved_marks(landmarks: int = 12, moves: int = 12) -> Iterator[str]:
+    """So many landmarks, and how many of them are moved."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        marks = make_site(folder, options.marks)
-        plain, with_rig = until_address(folder), until_address(folder, "--rig", "rig.json")
-        print(f"start to address: {with_rig:.2f} CPU s with --rig, {plain:.2f} without")
-        for by in ("rig", "cameras"):
+        marks = make_site(folder, landmarks)
+        found = {"`kcal mark --rig` to its address": until_address(folder, "--rig", "rig.json")}
+        for by in ("cameras", "rig"):
             with opened(folder, by) as desk:
-                report(desk, marks, min(options.moves, options.marks), by)
-
-
-if __name__ == "__main__":
-    main()
+                found[f"each moved mark, `--{by}`"] = report(desk, marks, min(moves, landmarks))
+    first = next(iter(found.values()))
+    rows = ([what, f"{seconds:.2f}", f"{seconds / first:.2g}"] for what, seconds in found.items())
+    yield from table(["", "CPU s", "of the first"], rows)

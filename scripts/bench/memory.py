@@ -1,20 +1,17 @@
 """Processor time and peak memory at steps of ten: long tables, large images, many points, many views.
 
-    python -m scripts.bench.memory [STEP ...] [--largest | --sizes N ...] [--write]
-
-Steps: table, points, image, detect, fleet, views. Each size is a process of its own with one thread, whose input is
-made before by this one; processor time and the memory's peak are those of that whole process, start included.
-`--largest` adds the sizes that take minutes. Peaks are of `/proc/self/status`, so Linux is needed.
+Each size is a process of its own with one thread, whose input is made before by this one; processor time and the
+memory's peak are those of that whole process, start included. `--largest` adds the sizes that take minutes. Peaks are
+of `/proc/self/status`, so Linux is needed.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,8 +22,8 @@ from kcal import Camera, load_rig, save_camera, save_rig
 from kcal.rig import Mounting
 from scripts.bench.locate_table import write_table
 from scripts.shared.long_range import ORIGIN, rig
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table
+from scripts.shared.sections import section
 from scripts.shared.views import simulate
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
@@ -237,22 +234,16 @@ def measured(step: Step, size: int) -> list[str]:
     return [step.title, f"{size:,}", f"{float(seconds):.1f}", f"{float(peak):,.0f}", said]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("steps", nargs="*", metavar="STEP", help=f"{', '.join(STEPS)}; all if none is given")
-    parser.add_argument("--largest", action="store_true", help="also the sizes that take minutes")
-    parser.add_argument("--sizes", type=int, nargs="+", metavar="N", help="in place of those of the steps")
-    parser.add_argument("--write", action="store_true", help="write the tables into docs/measured/precision.md")
-    given = parser.parse_args()
-    head = ["what", "size", "CPU s", "peak MB", "result"]
-    for name in given.steps or STEPS:
-        rows = []
-        for step in STEPS[name]:
-            for size in given.sizes or (*step.sizes, *(step.largest if given.largest else ())):
-                rows.append(measured(step, size))
-                show([str(rows[-1])])
-        write_section("precision.md", "fleet memory" if name == "fleet" else name, table(head, rows), write=given.write)
+def _registered(name: str) -> None:
+    @section("precision.md", "fleet memory" if name == "fleet" else name, sizes=(1,) if name == "image" else (100,))
+    def measure(largest: bool = False, sizes: tuple[int, ...] = (0,)) -> Iterator[str]:
+        rows = (
+            measured(step, size)
+            for step in STEPS[name]
+            for size in (sizes if any(sizes) else (*step.sizes, *(step.largest if largest else ())))
+        )
+        return table(["what", "size", "CPU s", "peak MB", "result"], rows)
 
 
-if __name__ == "__main__":
-    main()
+for _name in STEPS:
+    _registered(_name)

@@ -1,6 +1,4 @@
-"""Inverse nets and lookup tables, measured; two tables of docs/measured/lens.md.
-
-    python -m scripts.bench.nets [--rounds 15] [--write]
+"""Inverse nets and lookup tables, measured.
 
 Inverse nets: how good they are alone, how many evaluations of the lens they save as a start, and what that is worth in
 time.
@@ -12,7 +10,7 @@ from __future__ import annotations
 import io
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 from unittest import mock
 
@@ -29,10 +27,10 @@ from kcal.lens.zernike import ZernikeModes
 from kcal.nets import InverseNetOptions, train_inverse
 from scripts.bench.lens import LENS, SIZE
 from scripts.bench.lens import build as build_hd
-from scripts.shared.sections import run, section
-from scripts.shared.timing import ratio, row, show, spread, times
+from scripts.shared.page import table
+from scripts.shared.sections import section
+from scripts.shared.timing import ratio, show, spread, times
 
-PAGE = "lens.md"
 POINTS = 10_000
 # A lens of some 150 degrees, as fitted to a real one.
 WIDE = [0.4749, 0.02579, 3e-5, -9e-6, 8.2e-5, 0.7623, 0.09433, 1.329e-3, 3.1e-5, -2e-7, -2.6e-5, 3e-8, 1.1e-3, 1e-3]
@@ -84,14 +82,8 @@ def evaluations(camera: Camera, pixels: Tensor, start: InverseStart | None) -> i
     return counted.call_count
 
 
-def alone(seeds: int) -> list[str]:
+def alone(seeds: int) -> Iterator[list[object]]:
     """Accuracy of the nets themselves."""
-    lines = show(
-        [
-            "| camera | corrects | weights | fit, s | guess, RMS px | guess, max px | net, RMS px | net, max px |",
-            "|---|---|---|---|---|---|---|---|",
-        ]
-    )
     for name, build in CAMERAS.items():
         camera = build()
         for radial in (True, False):
@@ -104,29 +96,19 @@ def alone(seeds: int) -> list[str]:
                 statistics.median(values)
                 for values in zip(*((f.start_rms, f.start_largest, f.rms, f.largest) for f in fits), strict=True)
             ]
-            lines += show(
-                [
-                    row(
-                        name,
-                        "the radial start" if radial else "the distorted position",
-                        fits[0].net.weights.numel(),
-                        spread(seconds),
-                        *(f"{value:.2g}" for value in middle),
-                    )
-                ]
-            )
-    return lines
+            yield [
+                name, "the radial start" if radial else "the distorted position", fits[0].net.weights.numel(),
+                spread(seconds), *(f"{value:.2g}" for value in middle),
+            ]  # fmt: skip
 
 
+@section("lens.md", "inverse nets", rounds=1, seeds=1)
 @torch.no_grad()
-def as_start(rounds: int) -> list[str]:
+def inverse_nets(rounds: int = 15, seeds: int = 3) -> Iterator[str]:
     """Steps, evaluations and time of `unproject` with and without a net."""
-    lines = show(
-        [
-            "| camera | evaluations of the lens a call | with the net | time without / with |",
-            "|---|---|---|---|",
-        ]
-    )
+    heads = ["camera", "corrects", "weights", "fit, s", "guess, RMS px", "guess, max px", "net, RMS px"]
+    show([*table([*heads, "net, max px"], alone(seeds))])
+    rows = []
     for name, build in CAMERAS.items():
         camera = build()
         guess = train_inverse(camera).net.guess
@@ -135,28 +117,16 @@ def as_start(rounds: int) -> list[str]:
         assert torch.equal(plain[1], helped[1])
         assert float((plain[0] - helped[0]).abs().max()) < 1e-6
         found = times([lambda: camera.unproject(pixels), lambda: camera.unproject(pixels, start=guess)], rounds)  # noqa: B023
-        lines += show(
-            [
-                row(
-                    name,
-                    *(evaluations(camera, pixels, start) for start in (None, guess)),
-                    ratio(found[1], found[0]),
-                )
-            ]
-        )
-    return lines
+        saved = (evaluations(camera, pixels, start) for start in (None, guess))
+        rows.append([name, *saved, ratio(found[1], found[0])])
+    return table(["camera", "evaluations of the lens a call", "with the net", "time without / with"], rows)
 
 
+@section("lens.md", "lookup tables", rounds=1)
 @torch.no_grad()
-def tables(rounds: int) -> list[str]:
+def lookup_tables(rounds: int = 15) -> Iterator[str]:
     """Lookup tables of each camera."""
-    lines = show(
-        [
-            "| camera | tolerance, px | baking, s | file, kB | bound, px | largest error "
-            "found, px | answers for | project: camera / table | unproject: camera / table |",
-            "|---|---|---|---|---|---|---|---|---|",
-        ]
-    )
+    rows = []
     for name, build in CAMERAS.items():
         camera = build()
         pixels = random_pixels(camera, 10 * POINTS)
@@ -179,34 +149,10 @@ def tables(rounds: int) -> list[str]:
             found = times(calls, rounds)
             buffer = io.BytesIO()
             np.savez(buffer, **{key: value.numpy() for key, value in lookup.state_dict().items()})
-            lines += show(
-                [
-                    row(
-                        name,
-                        f"{tolerance:.0e}",
-                        f"{seconds:.1f}",
-                        round(len(buffer.getvalue()) / 1000),
-                        f"{max(lookup.bound):.1e}",
-                        f"{largest:.1e}",
-                        f"{100 * min(lookup.coverage):.1f} %",
-                        ratio(found[1], found[0]),
-                        ratio(found[3], found[2]),
-                    )
-                ]
-            )
-    return lines
-
-
-@section("lens.md", "inverse nets", rounds=1, seeds=1)
-def inverse_nets(rounds: int = 15, seeds: int = 3) -> list[str]:
-    show(alone(seeds))
-    return as_start(rounds)
-
-
-@section("lens.md", "lookup tables", rounds=1)
-def lookup_tables(rounds: int = 15) -> list[str]:
-    return tables(rounds)
-
-
-if __name__ == "__main__":
-    run()
+            rows.append([
+                name, f"{tolerance:.0e}", f"{seconds:.1f}", round(len(buffer.getvalue()) / 1000),
+                f"{max(lookup.bound):.1e}", f"{largest:.1e}", f"{100 * min(lookup.coverage):.1f} %",
+                ratio(found[1], found[0]), ratio(found[3], found[2]),
+            ])  # fmt: skip
+    heads = ["camera", "tolerance, px", "baking, s", "file, kB", "bound, px", "largest error found, px", "answers for"]
+    return table([*heads, "project: camera / table", "unproject: camera / table"], rows)

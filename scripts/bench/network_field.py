@@ -1,26 +1,21 @@
 """Compare the network field with fixed and trained features, the default field and ext20, by views that were held out.
 
-    KCAL_DATA=DATA python -m scripts.bench.network_field [--captures gavin_l st1_l] [--write]
-
 For each capture: RMS over held-out blocks of views (`kcal.calibrate.camera.at_setting`), and CPU seconds of one fit of
-all views. Also the error at infinity on a simulated lens with a dent (`scripts/shared/dented_lens.py`). `--write` puts
-both tables into docs/measured/network-field.md.
+all views. Also the error at infinity on a simulated lens with a dent (`scripts/shared/dented_lens.py`).
 """
 
 from __future__ import annotations
 
-import argparse
-import functools
-import os
 import time
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Iterator
 
 from kcal import CalibrationOptions, KcalError, Observations, calibrate_camera
 from kcal.calibrate import compare_models
 from kcal.nets import FieldTraining
 from scripts.shared.dented_lens import capture, network, off
-from scripts.shared.page import table, write_row
+from scripts.shared.page import merged, table
+from scripts.shared.real_captures import data_folder
+from scripts.shared.sections import section
 
 CAPTURES = ("gavin_l", "gavin_r", "st1_l", "lanhp_l", "luisa39", "carnd18", "fish_l", "kaidan", "ch1280", "sq1280")
 # Name -> lens model and training.
@@ -43,7 +38,7 @@ def measure(seen: Observations, name: str, parts: int) -> tuple[float, float]:
     return held, time.process_time() - begin
 
 
-def cells(seen: Observations, parts: int, tell: Callable[[str], object]) -> list[str]:
+def cells(seen: Observations, parts: int) -> list[str]:
     """For each lens the held-out RMS, and CPU seconds in brackets."""
     out = []
     for name in FITS:
@@ -52,13 +47,20 @@ def cells(seen: Observations, parts: int, tell: Callable[[str], object]) -> list
             out.append(f"{held:.4f} ({seconds:.1f})")
         except KcalError as error:
             # A lens that does not fit is a result, too.
-            tell(f"{name}: {error}")
+            print(f"{name}: {error}", flush=True)
             out.append("does not fit")
-        tell(f"{name}: {out[-1]}")
     return out
 
 
-def dent() -> list[str]:
+@section("network-field.md", "captures", names=("sq1280",))
+def captures(names: tuple[str, ...] = CAPTURES, parts: int = 3) -> Iterator[str]:
+    found = ((name, Observations.load(data_folder() / "captures" / f"{name}.obs.json")) for name in names)
+    rows = ([name, len(seen.views), *cells(seen, parts)] for name, seen in found)
+    return merged("network-field.md", "captures", ["capture", "views", *FITS], rows)
+
+
+@section("network-field.md", "dent")
+def dent() -> Iterator[str]:
     """For each lens the error at infinity over the middle of the image of a lens with a dent, pixels."""
     out = []
     for model, training in FITS.values():
@@ -70,28 +72,4 @@ def dent() -> list[str]:
         begin = time.process_time()
         camera = calibrate_camera(capture(), options).camera
         out.append(f"{off(camera):.3f} ({time.process_time() - begin:.1f})")
-    return out
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--captures", nargs="*", default=list(CAPTURES))
-    parser.add_argument("--parts", type=int, default=3)
-    parser.add_argument("--write", action="store_true")
-    given = parser.parse_args()
-    keep(given.write, "dent", ["lens", *FITS], ["with a dent of 3 px", *dent()])
-    for name in given.captures:
-        seen = Observations.load(Path(os.environ["KCAL_DATA"], "captures", f"{name}.obs.json"))
-        found = cells(seen, given.parts, functools.partial(print, name, flush=True))
-        keep(given.write, "captures", ["capture", "views", *FITS], [name, len(seen.views), *found])
-
-
-def keep(write: bool, section: str, heads: Sequence[object], row: Sequence[object]) -> None:
-    """Print a row, and put it into its table of the page."""
-    print("\n".join(table(heads, [row])), flush=True)
-    if write:
-        write_row("network-field.md", section, heads, row)
-
-
-if __name__ == "__main__":
-    main()
+    return table(["lens", *FITS], [["with a dent of 3 px", *out]])

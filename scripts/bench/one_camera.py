@@ -1,13 +1,8 @@
 """The hybrid camera, fitted by evidence, on real captures: views that were held out, beside parametric models.
 
-    KCAL_DATA=DATA python -m scripts.bench.one_camera --split blocks20        # the wide lens, whole blocks held out
-    KCAL_DATA=DATA python -m scripts.bench.one_camera --split evenodd
-    KCAL_DATA=DATA python -m scripts.bench.one_camera --views 8               # fitted to 8 of its views, three draws
-    KCAL_DATA=DATA python -m scripts.bench.one_camera --stereo                # OpenCV's images, one view left out
-    KCAL_DATA=DATA python -m scripts.bench.one_camera --epipolar              # the same, 9 pairs fitted and 4 held out
-    KCAL_MRCAL=/usr/bin/python3 ... --models mrcal                            # mrcal's spline too, of the wide lens
-
-With --write the row goes into the table of docs/measured/one-camera.md.
+The wide lens in blocks or every other view, or all but 8 of its views in three draws; OpenCV's images with one view
+left out, and their pairs, 9 fitted and 4 held out. mrcal's spline, of the wide lens, where KCAL_MRCAL names an
+interpreter that has mrcal; elsewhere its cells stay as the page has them.
 
 On each held-out view only its pose is solved again; camera and board stay as fitted. Measure: sqrt(sum w² |r|² / count)
 over all folds, with the weights of the file (OpenCV's images: all one). Epipolar error:
@@ -16,26 +11,24 @@ Sampson's distance of held-out corners in pixels, which needs no board.
 
 from __future__ import annotations
 
-import argparse
 import functools
+import itertools
 import math
 import os
-import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Board, Camera, Observations, Rig, RigOptions, calibrate_rig, detect
+from kcal import Camera, Observations, Rig, RigOptions, calibrate_rig
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.hybrid.fit import fit_hybrid
-from kcal.corners.images import expand_images
 from scripts.shared.mrcal_spline import splined
-from scripts.shared.page import write_row
-from scripts.shared.timing import row, show
-from scripts.shared.wide_lens import folds, held_out, load, warped
+from scripts.shared.page import merged
+from scripts.shared.real_captures import stereo_images
+from scripts.shared.sections import section
+from scripts.shared.wide_lens import folds, load, over_parts, warped
 
 # The spline of mrcal that predicts held-out views of the wide lens best, and about its focal length, pixels.
 SPLINE, FOCAL = "SPLINED11x8", 1900.0
@@ -83,16 +76,8 @@ def with_mrcal(seen: Observations, weight: Tensor, parts: list[np.ndarray]) -> s
 def measure(name: str, seen: Observations, weight: Tensor, parts: list[np.ndarray]) -> str:
     if name == "mrcal":
         return with_mrcal(seen, weight, parts)
-    total, seconds, count = 0.0, 0.0, 0
-    for out in parts:
-        train = np.setdiff1d(np.arange(len(seen.views)), out)
-        start = time.process_time()
-        camera, points = MODELS[name](seen.subset([seen.names[i] for i in train]), weight[train])
-        seconds += time.process_time() - start
-        test = seen.subset([seen.names[i] for i in out])
-        error, corners = held_out(camera, points, test, weight[out])
-        total, count = total + error, count + corners
-    return f"{math.sqrt(total / count):.4f} ({seconds / len(parts):.1f} s)"
+    error, seconds = over_parts(MODELS[name], seen, weight, parts)
+    return f"{error:.4f} ({seconds:.1f} s)"
 
 
 def epipolar(rig: Rig, left: Tensor, right: Tensor) -> Tensor:
@@ -127,55 +112,34 @@ def measure_epipolar(name: str, sides: list[Observations]) -> float:
     return float(torch.cat(errors).square().mean().sqrt())
 
 
-def stereo_images() -> list[Observations]:
-    """OpenCV's stereo images."""
-    paths = expand_images([str(Path(os.environ["KCAL_DATA"], "opencv_stereo"))])
-    board = Board(columns=9, rows=6, square=0.025)
-    sides = ("left", "right")
-    return [detect([path for path in paths if path.name.startswith(side)], board) for side in sides]
+def cases(few: int) -> Iterator[tuple[str, Callable[[str], str], bool]]:
+    """What is held out, the cell of a model, and whether mrcal can do it."""
+    seen, weights = load()
+    weight, count = torch.from_numpy(weights), len(seen.views)
+    draws = [np.random.default_rng(seed).permutation(count)[few:] for seed in (100, 101, 102)]
+    splits = {words: folds(split, count) for split, words in SPLITS.items()} | {f"all but {few} views": draws}
+    for words, parts in splits.items():
+        yield f"wide lens, {words}", functools.partial(measure, seen=seen, weight=weight, parts=parts), True
+    sides = [stereo_images(side) for side in ("left", "right")]
+    for side, one in zip(("left", "right"), sides, strict=True):
+        all_seen = torch.isfinite(one.pixels()).all(-1).double()
+        each = [np.array([i]) for i in range(len(one.views))]
+        yield (
+            f"OpenCV's images, {side}, each view",
+            functools.partial(measure, seen=one, weight=all_seen, parts=each), False,
+        )  # fmt: skip
+    yield "OpenCV's pairs, 4 of 13", lambda name: f"{measure_epipolar(name, sides):.4f}", False
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--split", choices=list(SPLITS), help="of the wide lens")
-    parser.add_argument("--views", type=int, help="fitted of the wide lens, all others held out")
-    parser.add_argument("--stereo", action="store_true", help="OpenCV's stereo images, both cameras")
-    parser.add_argument("--epipolar", action="store_true", help="OpenCV's stereo images, pairs")
-    parser.add_argument("--models", nargs="*", default=list(MODELS), choices=[*MODELS, "mrcal"])
-    parser.add_argument("--write", action="store_true", help="write the tables into the page")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    columns = [*MODELS, "mrcal"]
-
-    def tell(name: str, measured: Callable[[str], str]) -> None:
-        cells = [measured(model) if model in arguments.models else None for model in columns]
-        show([row(name, *(cell or "" for cell in cells))])
-        if arguments.write:
-            write_row("one-camera.md", "held-out", ["held out", *MODELS, f"mrcal, {SPLINE}"], [name, *cells])
-
-    if arguments.split:
-        seen, weights = load()
-        parts = folds(arguments.split, len(seen.views))
-        tell(
-            f"wide lens, {SPLITS[arguments.split]}", lambda name: measure(name, seen, torch.from_numpy(weights), parts)
-        )
-    if arguments.views:
-        seen, weights = load()
-        draws = [
-            np.random.default_rng(seed).permutation(len(seen.views))[arguments.views :] for seed in (100, 101, 102)
+@section("one-camera.md", "held-out", models=("opencv5",), first=1)
+def held_out_views(models: tuple[str, ...] = tuple(MODELS), views: int = 8, first: int = 6) -> Iterator[str]:
+    """With so many views of the wide lens fitted in one of its rows; the first rows only."""
+    chosen = {*models, *(["mrcal"] if "KCAL_MRCAL" in os.environ else [])}
+    rows = (
+        [
+            what,
+            *(cell(model) if model in chosen and (able or model != "mrcal") else None for model in [*MODELS, "mrcal"]),
         ]
-        name = f"wide lens, all but {arguments.views} views"
-        tell(name, lambda name: measure(name, seen, torch.from_numpy(weights), draws))
-    if arguments.stereo:
-        for side, seen in zip(("left", "right"), stereo_images(), strict=True):
-            weight = torch.isfinite(seen.pixels()).all(-1).double()
-            each = [np.array([i]) for i in range(len(seen.views))]
-            fitted = functools.partial(measure, seen=seen, weight=weight, parts=each)
-            tell(f"OpenCV's images, {side}, each view", fitted)
-    if arguments.epipolar:
-        sides = stereo_images()
-        tell("OpenCV's pairs, 4 of 13", lambda name: f"{measure_epipolar(name, sides):.4f}")
-
-
-if __name__ == "__main__":
-    main()
+        for what, cell, able in itertools.islice(cases(views), first)
+    )
+    return merged("one-camera.md", "held-out", ["held out", *MODELS, f"mrcal, {SPLINE}"], rows)

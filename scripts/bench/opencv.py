@@ -1,35 +1,32 @@
 """kcal beside OpenCV on OpenCV's own 13 stereo pairs: projection, calibration, rig, time.
 
-    KCAL_DATA=folder python -m scripts.bench.opencv [--repeats 5] [--write]
-
-The folder holds `opencv_stereo/left01.jpg` ... `right14.jpg` (OpenCV's samples; Debian ships them in opencv-doc). Both
+KCAL_DATA holds `opencv_stereo/left01.jpg` ... `right14.jpg` (OpenCV's samples; Debian ships them in opencv-doc). Both
 sides get the same corners, found by kcal and rounded to float32, as OpenCV wants them. RMS is sqrt(mean ‖r‖²) over
 points, of OpenCV as it returns it. Times are of whole calls in one process on one thread, the two sides in turn.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
+import functools
+import itertools
 import statistics
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 
-from kcal import Board, Camera, Observations, RigOptions, calibrate_rig, detect
+from kcal import Camera, Observations, RigOptions, calibrate_rig
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.report.judge_rig import triangulated_sides
 from kcal.rig import pair_by_name
-from scripts.shared.page import write_section
+from scripts.shared.page import table
+from scripts.shared.real_captures import stereo_images
+from scripts.shared.sections import section
 
-BOARD = Board(columns=9, rows=6, square=0.025)
 CRITERIA = (3, 300, 1e-12)
 FLAGS = {
     "opencv5": 0,
@@ -39,35 +36,9 @@ FLAGS = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=5, help="timed runs of each side")
-    parser.add_argument("--write", action="store_true", help="write the tables into docs/measured/other-programs.md")
-    arguments = parser.parse_args()
-    folder = os.environ.get("KCAL_DATA")
-    if not folder or not Path(folder, "opencv_stereo").is_dir():
-        sys.exit("set KCAL_DATA to the folder that holds opencv_stereo/")
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-
-    seen = {side: _observe(Path(folder, "opencv_stereo"), side) for side in ("left", "right")}
-    parts: dict[str, Callable[[], list[str]]] = {
-        "opencv, cameras": lambda: _calibration(seen, arguments.repeats),
-        "opencv, projection": _projection,
-        "opencv, rig": lambda: _rig(seen, arguments.repeats),
-    }
-    for name, made in parts.items():
-        lines = made()
-        write_section("other-programs.md", name, lines, write=arguments.write)
-
-
-def _show(lines: list[str]) -> list[str]:
-    print("\n".join(lines), flush=True)
-    return lines
-
-
-def _observe(folder: Path, side: str) -> Observations:
-    found = detect(sorted(folder.glob(f"{side}*.jpg")), BOARD)
+@functools.cache
+def _observe(side: str) -> Observations:
+    found = stereo_images(side)
     views = []
     for view in found.views:
         rounded = tuple(p if p is None else (float(np.float32(p[0])), float(np.float32(p[1]))) for p in view.pixels)
@@ -75,8 +46,9 @@ def _observe(folder: Path, side: str) -> Observations:
     return found.model_copy(update={"views": tuple(views)})
 
 
-def _projection() -> list[str]:
-    lines = ["| coefficients | largest difference, px |", "|---|---|"]
+@section("other-programs.md", "opencv, projection")
+def projection() -> Iterator[str]:
+    rows = []
     generator = np.random.default_rng(0)
     lens = generator.normal(size=14) * [0.2, 0.05, 1e-3, 1e-3, 0.02, 0.05, 0.02, 0.01, *[1e-3] * 4, 0.02, 0.02]
     points = generator.uniform(-1, 1, (2000, 3)) * [1.2, 0.7, 0.5] + [0, 0, 2]
@@ -92,34 +64,24 @@ def _projection() -> list[str]:
         )
         ours, valid = camera.project(torch.from_numpy(points))
         difference = np.abs(ours.numpy() - theirs)[valid.numpy()].max()
-        lines.append(f"| {count} | {difference:.1e} ({int(valid.sum())} points) |")
-    return _show(lines)
+        rows.append([count, f"{difference:.1e} ({int(valid.sum())} points)"])
+    return table(["coefficients", "largest difference, px"], rows)
 
 
-def _calibration(seen: dict[str, Observations], repeats: int) -> list[str]:
-    lines = _show(
-        [
-            "| camera | model | RMS kcal, px | RMS OpenCV | difference | kcal, ms | OpenCV, ms | ratio |",
-            "|---|---|---|---|---|---|---|---|",
-        ]
-    )
-    for side, observations in seen.items():
-        for model in FLAGS:
-            ours, theirs, times = _in_turn(
-                partial(
-                    calibrate_camera, observations, CalibrationOptions(model=model, weak_prior=None, weighted=False)
-                ),
-                partial(_opencv, observations, model),
-                repeats,
-            )
-            ratios = [a / b for a, b in zip(*times, strict=True)]
-            lines += _show(
-                [
-                    f"| {side} | {model} | {ours.rms:.7f} | {theirs[0]:.7f} | {ours.rms - theirs[0]:+.1e} "
-                    f"| {_median(times[0], 1e3)} | {_median(times[1], 1e3)} | {_median(ratios)} |"
-                ]
-            )
-    return lines
+@section("other-programs.md", "opencv, cameras", repeats=1, models=("opencv5",))
+def cameras(repeats: int = 5, models: tuple[str, ...] = tuple(FLAGS)) -> Iterator[str]:
+    rows = []
+    for side, model in itertools.product(("left", "right"), models):
+        options = CalibrationOptions(model=model, weak_prior=None, weighted=False)
+        seen = _observe(side)
+        ours, theirs, times = _in_turn(partial(calibrate_camera, seen, options), partial(_opencv, seen, model), repeats)
+        ratios = [a / b for a, b in zip(*times, strict=True)]
+        rows.append([
+            side, model, f"{ours.rms:.7f}", f"{theirs[0]:.7f}", f"{ours.rms - theirs[0]:+.1e}",
+            _median(times[0], 1e3), _median(times[1], 1e3), _median(ratios),
+        ])  # fmt: skip
+    heads = ["camera", "model", "RMS kcal, px", "RMS OpenCV", "difference", "kcal, ms", "OpenCV, ms", "ratio"]
+    return table(heads, rows)
 
 
 def _median(values: list[float], factor: float = 1.0) -> str:
@@ -155,36 +117,26 @@ def _opencv(observations: Observations, model: str) -> Any:
     return cv2.calibrateCamera(boards, pixels, size, None, None, flags=FLAGS[model], criteria=CRITERIA)
 
 
-def _rig(seen: dict[str, Observations], repeats: int) -> list[str]:
-    lines = _show(
-        [
-            "| intrinsics | side | baseline, mm | RMS, px | squares, mm | ms |",
-            "|---|---|---|---|---|---|",
-        ]
-    )
-    left, right = seen["left"], seen["right"]
+@section("other-programs.md", "opencv, rig", repeats=1)
+def rig(repeats: int = 5) -> Iterator[str]:
+    rows = []
+    left, right = _observe("left"), _observe("right")
     five = CalibrationOptions(model="opencv5")
-    cameras = (calibrate_camera(left, five).camera, calibrate_camera(right, five).camera)
+    both = (calibrate_camera(left, five).camera, calibrate_camera(right, five).camera)
     pairs = pair_by_name(left.names, right.names)
     for word, refine in (("fixed", False), ("refined jointly", True)):
         options = RigOptions(intrinsics="free" if refine else "fixed", reject=False)
         ours, theirs, times = _in_turn(
-            partial(calibrate_rig, *cameras, left, right, pairs, options),
-            partial(_opencv_stereo, left, right, cameras, refine),
+            partial(calibrate_rig, *both, left, right, pairs, options),
+            partial(_opencv_stereo, left, right, both, refine),
             repeats,
         )
-        rig = ours.stereo()
-        side = triangulated_sides(rig, BOARD.columns, BOARD.rows, ours.pixels)
-        rms, baseline, mean, spread = theirs
-        lines += _show(
-            [
-                f"| {word} | kcal | {1e3 * float(rig.baseline):.5f} | {ours.rms:.7f} "
-                f"| {1e3 * side.mean:.4f} ± {1e3 * side.spread:.4f} | {_median(times[0], 1e3)} |",
-                f"| {word} | OpenCV | {1e3 * baseline:.5f} | {rms:.7f} | {1e3 * mean:.4f} ± {1e3 * spread:.4f} "
-                f"| {_median(times[1], 1e3)} |",
-            ]
-        )
-    return lines
+        side = triangulated_sides(ours.stereo(), left.board.columns, left.board.rows, ours.pixels)
+        found = ours.rms, float(ours.stereo().baseline), side.mean, side.spread
+        for who, (rms, baseline, mean, spread), spent in zip(("kcal", "OpenCV"), (found, theirs), times, strict=True):
+            squares = f"{1e3 * mean:.4f} ± {1e3 * spread:.4f}"
+            rows.append([word, who, f"{1e3 * baseline:.5f}", f"{rms:.7f}", squares, _median(spent, 1e3)])
+    return table(["intrinsics", "side", "baseline, mm", "RMS, px", "squares, mm", "ms"], rows)
 
 
 def _opencv_stereo(
@@ -202,15 +154,11 @@ def _opencv_stereo(
     for points, p, q in zip(boards, a, b, strict=True):
         u, v = cv2.undistortPoints(p, K1, D1)[:, 0], cv2.undistortPoints(q, K2, D2)[:, 0]
         homogeneous = cv2.triangulatePoints(P1, P2, u.T.astype(float), v.T.astype(float))
-        every_corner = np.full((BOARD.corners, 3), np.nan)
+        every_corner = np.full((left.board.corners, 3), np.nan)
         every_corner[(place[:, None] == points).all(-1).any(1)] = (homogeneous[:3] / homogeneous[3]).T
-        grid = every_corner.reshape(BOARD.rows, BOARD.columns, 3)
+        grid = every_corner.reshape(left.board.rows, left.board.columns, 3)
         for step in (np.diff(grid, axis=0), np.diff(grid, axis=1)):
             side = np.linalg.norm(step, axis=-1).ravel()
             sides.append(side[np.isfinite(side)])
     every = np.concatenate(sides)
     return rms, float(np.linalg.norm(T)), float(every.mean()), float(every.std(ddof=1))
-
-
-if __name__ == "__main__":
-    main()

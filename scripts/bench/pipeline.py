@@ -1,9 +1,5 @@
 """Time of one frame from detections to positions: 1, 10 and 100 objects, eager and compiled.
 
-    python -m scripts.bench.pipeline --write           docs/measured/pairing.md, section latency
-    python -m scripts.bench.pipeline --calls 20 --no-compile
-    python -m scripts.bench.pipeline --gradients --write   section gradients: compiling, and derivatives
-
 One thread. `localize` is `Localizer` alone, with a covariance for each pair, compiled step by step
 (`whole_graph`) with `cpp_wrapper`;
 `associate` pairs as many detections of both images; `match` is `ObjectDisparity` on boxes of 12 px, all of which have
@@ -12,10 +8,8 @@ their image in both. One graph is compiled for any number of pairs from two; a s
 
 from __future__ import annotations
 
-import argparse
-import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -29,7 +23,9 @@ from kcal.pipeline.association import associate
 from kcal.rig import RigCovariance, planned_rig
 from kcal.track import Detections, ObjectDisparity
 from scripts.check.pairing import OPTIONS, SIZE, site_rig
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.sections import section
+from scripts.shared.timing import children_seconds
 
 COUNTS = (1, 10, 100)
 PAIRS = 4096
@@ -52,8 +48,7 @@ def milliseconds(call: Callable[[], object], calls: int) -> str:
 
 def processor() -> float:
     """Seconds of processor time, with those of compilers that were started."""
-    both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return sum(each.ru_utime + each.ru_stime for each in both)
+    return time.process_time() + children_seconds()
 
 
 def spent(calls: list[Callable[[], object]], rounds: int = 9) -> list[str]:
@@ -92,13 +87,14 @@ def backward(call: Callable[..., Tensor], *inputs: Tensor) -> None:
     call(*(value.detach().clone().requires_grad_() for value in inputs)).sum().backward()
 
 
-def gradients() -> str:
+@section("pairing.md", "gradients", lenses=("pinhole", "opencv5"))
+def gradients(lenses: tuple[str, ...] = tuple(LENSES)) -> Iterator[str]:
     """Tables: compiling, and derivatives beside kornia."""
-    made = {lens: localizer(lens) for lens in LENSES}
-    rows, compiled = [], {}
+    made = {lens: localizer(lens) for lens in lenses}
+    rows = []
     for lens, (localize, left, right) in made.items():
         torch.compiler.reset()
-        run = compiled[lens] = torch.compile(localize, fullgraph=True, dynamic=True)
+        run = torch.compile(localize, fullgraph=True, dynamic=True)
         costs = []
         for count in (100, 200):
             start = processor()
@@ -113,13 +109,13 @@ def gradients() -> str:
             calls += [lambda f=f, p=pair: f(*p) for f in (localize, run)]  # type: ignore[misc]
         calls += [lambda f=f: backward(lambda a, b: f(a, b).enu, left, right) for f in (localize, run)]  # type: ignore[misc]  # noqa: B023
         rows.append([lens, *(f"{cost:.1f}" for cost in costs), *spent(calls)])
-        print(*rows[-1], sep=" | ", flush=True)
     heads = ["lens", "compiling, s", "second shape, s", "with gradients, s"]
     heads += [
         f"{what}, {how}, ms" for what in ("100", PAIRS, f"{PAIRS} with gradients") for how in ("eager", "compiled")
     ]
-    text = "Processor time of `Localizer`, one thread: `python -m scripts.bench.pipeline --gradients --write`.\n\n"
-    text += "\n".join(table(heads, rows))
+    yield "Processor time of `Localizer`, one thread:"
+    yield ""
+    yield from table(heads, rows)
     camera = made["opencv5"][0].rig.left
     pixels, K, d = made["opencv5"][1], camera.matrix, camera.coefficients
     rays = camera.unproject(pixels)[0]
@@ -142,15 +138,10 @@ def gradients() -> str:
             lambda: backward(lambda x, y: triangulate_points(P[None], Q[None], x[None], y[None]), a, b),
         ],
     }
-    rates = []
-    for name, both in each.items():
-        found = [float(value) for value in spent(both)]
-        rates.append([name, *(f"{1e-3 * PAIRS / value:.2g}" for value in found)])
-        print(*rates[-1], sep=" | ", flush=True)
-    return (
-        text
-        + "\n\nMillions of points a second, forward and backward:\n\n"
-        + "\n".join(table(["", "kcal", "kornia"], rates))
+    yield from ["", "Millions of points a second, forward and backward:", ""]
+    found = ((name, map(float, spent(both))) for name, both in each.items())
+    yield from table(
+        ["", "kcal", "kornia"], ([name, *(f"{1e-3 * PAIRS / value:.2g}" for value in both)] for name, both in found)
     )
 
 
@@ -159,22 +150,13 @@ def boxes(pixels: Tensor) -> Detections:
     return Detections.read(torch.cat([pixels - 6, pixels + 6], -1), size=SIZE, first_pixel=0.0)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--calls", type=int, default=200)
-    parser.add_argument("--no-compile", action="store_true")
-    parser.add_argument("--write", action="store_true")
-    parser.add_argument("--gradients", action="store_true")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    if options.gradients:
-        text = gradients()
-        write_section("pairing.md", "gradients", text, write=options.write)
-        return
+@section("pairing.md", "latency", calls=3, eager=True)
+def latency(calls: int = 200, eager: bool = False) -> Iterator[str]:
+    """So many calls of each; `eager` leaves out the compiled one."""
     rig = site_rig()
     localize = Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
     compiled = None
-    if not options.no_compile:
+    if not eager:
         localize.whole_graph = True
         compiled = torch.compile(localize, fullgraph=True, dynamic=True, options={"cpp_wrapper": True})
     match = ObjectDisparity(planned_rig())
@@ -195,7 +177,7 @@ def main() -> None:
         objects = (pixels.clamp_min(60.0)).round()
         aims = objects - torch.tensor([SHIFT - 1.0, 0.5], dtype=torch.float64)
         seen = boxes(objects).boxes
-        calls: list[Callable[[], object]] = [lambda a=pixels, b=others, c=covariance: localize(a, b, c)]  # type: ignore[misc]
+        work: list[Callable[[], object]] = [lambda a=pixels, b=others, c=covariance: localize(a, b, c)]  # type: ignore[misc]
         if compiled is not None:
             given = (pixels, others, covariance)
             twice = [torch.cat([value, value])[: max(count, 2)] for value in given]
@@ -204,24 +186,11 @@ def main() -> None:
                 start = time.process_time()
                 compiled(*(value.repeat(10, *[1] * (value.ndim - 1)) for value in given))
                 print(f"compiled in {time.process_time() - start:.0f} s of processor time", flush=True)
-            calls.append(lambda of=twice: compiled(*of))  # type: ignore[misc]
-        calls.append(lambda a=first, b=second: associate(rig, a, b, OPTIONS))  # type: ignore[misc]
-        calls.append(lambda a=seen, b=aims: match(left, right, a, b))  # type: ignore[misc]
-        rows.append([count, *(milliseconds(call, options.calls) for call in calls)])
-        print(*rows[-1], sep=" | ", flush=True)
-    heads = [
-        "objects",
-        "localize, eager",
-        *(["localize, compiled"] if compiled is not None else []),
-        "associate",
-        "match",
-    ]
-    text = (
-        "Milliseconds a call: median / 99th percentile (processor time, mean). Made by "
-        "`python -m scripts.bench.pipeline --write`.\n\n" + "\n".join(table(heads, rows))
-    )
-    write_section("pairing.md", "latency", text, write=options.write)
-
-
-if __name__ == "__main__":
-    main()
+            work.append(lambda of=twice: compiled(*of))  # type: ignore[misc]
+        work.append(lambda a=first, b=second: associate(rig, a, b, OPTIONS))  # type: ignore[misc]
+        work.append(lambda a=seen, b=aims: match(left, right, a, b))  # type: ignore[misc]
+        rows.append([count, *(milliseconds(call, calls) for call in work)])
+    heads = ["objects", "localize, eager", *(["localize, compiled"] if not eager else []), "associate", "match"]
+    yield "Milliseconds a call: median / 99th percentile (processor time, mean)."
+    yield ""
+    yield from table(heads, rows)

@@ -1,10 +1,6 @@
-"""Time and accuracy of calibration against other solvers on simulated views; a section of docs/measured/solver.md.
+"""Time and accuracy of calibration against other solvers on simulated views.
 
-    python -m scripts.bench.solver                          all sizes and models, three runs each
-    python -m scripts.bench.solver --views 15 50 --coefficients 5 14 --repeats 1
-    KCAL_PEERS=/path/to/env/bin/python python -m scripts.bench.solver    Ceres too, from an environment with pyceres
-    KCAL_MRCAL=/usr/bin/python3 python -m scripts.bench.solver           mrcal too, from one with mrcal and cv2
-
+KCAL_PEERS names an interpreter that has pyceres, KCAL_MRCAL one that has mrcal and cv2; else these are left out.
 Every solver runs in its own process, warmed up on a few views, and measures the processor time of the calibration
 alone. kcal and OpenCV calibrate from nothing; Ceres and mrcal start from `cv2.initCameraMatrix2D` and the true tilts,
 without which they keep flipped boards. The runs of all solvers alternate. RMS is recomputed from each solution alike. A
@@ -13,7 +9,6 @@ lens that folds between the corners is no lens: such a solution is marked, and d
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import statistics
@@ -21,14 +16,15 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scripts.shared.memory import peak_megabytes
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import row, show
+from scripts.shared.page import table
+from scripts.shared.sections import section
 from scripts.shared.views import (
     COLUMNS,
     MODELS,
@@ -45,8 +41,6 @@ from scripts.shared.views import (
 
 # Solutions whose relative excess of RMS is below this count as equally good.
 SAME = 1e-4
-# Sections of the page, one for each number of coefficients; 20 have no peer and are printed only.
-SECTIONS = {5: "5 coefficients", 8: "8 coefficients", 14: "14 coefficients"}
 COLUMN_NAMES = ("RMS px", "excess", "truth px", "flipped", "memory MB")
 
 
@@ -179,9 +173,7 @@ SOLVERS = {
     "mrcal": with_mrcal,
 }
 # The models that each of them has; 5 coefficients have no use for the weak prior.
-KNOWN = {"kcal": (5, 8, 14, 20), "kcal, weak prior": (8, 14, 20), "OpenCV": (5, 8, 14), "Ceres": (5, 8, 14)} | {
-    "mrcal": (5, 8)
-}
+KNOWN = {"kcal": (5, 8, 14), "kcal, weak prior": (8, 14), "OpenCV": (5, 8, 14), "Ceres": (5, 8, 14), "mrcal": (5, 8)}
 PYTHON = {"Ceres": "KCAL_PEERS", "mrcal": "KCAL_MRCAL"}
 
 
@@ -229,9 +221,10 @@ def judge(data: dict[str, np.ndarray], solution: dict[str, np.ndarray], coeffici
 
 def run(name: str, path: Path, coefficients: int, timeout: float) -> dict[str, Any]:
     python = os.environ[PYTHON[name]] if name in PYTHON else sys.executable
-    command = [python, "-m", "scripts.bench.solver", "--work", name, str(path), str(coefficients)]
+    code = f"from scripts.bench.solver import work; work({name!r}, {str(path)!r}, {coefficients})"
+    command, one_thread = [python, "-c", code], os.environ | {"OMP_NUM_THREADS": "1"}
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=True)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=True, env=one_thread)
     except subprocess.TimeoutExpired:
         return {"failed": f"> {timeout:.0f} s"}
     except subprocess.CalledProcessError as error:
@@ -240,18 +233,19 @@ def run(name: str, path: Path, coefficients: int, timeout: float) -> dict[str, A
     return found
 
 
-def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> tuple[list[list[Any]], dict[str, float]]:
-    """Rows of the table for one problem, and the median seconds of each solver."""
-    names = [name for name in arguments.solvers if coefficients in KNOWN[name]]
+def compare(views: int, coefficients: int, repeats: int, timeout: float) -> Iterator[list[Any]]:
+    """Rows of the table for one problem."""
+    able = [name for name in SOLVERS if name not in PYTHON or os.environ.get(PYTHON[name])]
+    names = [name for name in able if coefficients in KNOWN[name]]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "views.npz"
         data = simulate(views)
         np.savez(path, **data)  # type: ignore[arg-type]
         runs: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
-        for _ in range(arguments.repeats):
+        for _ in range(repeats):
             for name in names:
                 if not any("failed" in one for one in runs[name]):
-                    runs[name].append(run(name, path, coefficients, arguments.timeout))
+                    runs[name].append(run(name, path, coefficients, timeout))
         judged = {
             name: judge(data, dict(np.load(path.with_suffix(f".{name}.npz"))), coefficients)
             for name in names
@@ -259,11 +253,10 @@ def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> tup
         }
     best = min((one["rms"] for one in judged.values() if one["regular"]), default=float("nan"))
     own = {name: [one.get("seconds", float("nan")) for one in runs[name]] for name in names if name.startswith("kcal")}
-    lines: list[list[Any]] = []
     for name in names:
         mine = ("kcal",) if coefficients == 5 else ("kcal", "kcal, weak prior")
         if name not in judged:
-            lines.append([views, name, runs[name][-1]["failed"], *[""] * (len(mine) + len(COLUMN_NAMES))])
+            yield [views, name, runs[name][-1]["failed"], *[""] * (len(mine) + len(COLUMN_NAMES))]
             continue
         seconds = [one["seconds"] for one in runs[name]]
         cells = []
@@ -276,60 +269,19 @@ def compare(views: int, coefficients: int, arguments: argparse.Namespace) -> tup
         if one["regular"] and one["rms"] / best - 1 <= SAME:
             excess = "best"
         memory = max(entry["megabytes"] for entry in runs[name])
-        lines.append([
+        yield [
             views, name, f"{1e3 * statistics.median(seconds):.0f}", *cells, f"{one['rms']:.6f}", excess,
             f"{one['truth']:.2f}", one["flipped"], f"{memory:.0f}",
-        ])  # fmt: skip
-    return lines, {name: statistics.median(one["seconds"] for one in runs[name]) for name in judged}
+        ]  # fmt: skip
 
 
-def growth(seconds: dict[tuple[int, int], dict[str, float]]) -> list[str]:
-    """How kcal's time grows with the views and with the coefficients."""
-    lines = []
-    sizes, models = sorted({views for views, _ in seconds}), sorted({count for _, count in seconds})
-    for name in ("kcal", "kcal, weak prior"):
-        told = []
-        for count in models:
-            known = [(views, seconds[views, count][name]) for views in sizes if name in seconds[views, count]]
-            if len(known) > 1:
-                (few, quick), (many, slow) = known[-2:]
-                told.append(f"{count} coefficients {np.log(slow / quick) / np.log(many / few):.2f}")
-        if told:
-            lines.append(f"Time of *{name}* grows with the views, {few} to {many}, to the power of: {', '.join(told)}.")
-        pairs = [
-            f"{seconds[views, 20][name] / seconds[views, 14][name]:.2f} at {views}"
-            for views in sizes
-            if name in seconds.get((views, 20), {}) and name in seconds.get((views, 14), {})
-        ]
-        if pairs:
-            lines.append(f"20 coefficients take, times 14: {', '.join(pairs)} views.")
-    return lines
-
-
-def main() -> None:
-    if sys.argv[1:2] == ["--work"]:
-        work(sys.argv[2], sys.argv[3], int(sys.argv[4]))
-        return
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--views", type=int, nargs="*", default=[15, 50, 200, 800])
-    parser.add_argument("--coefficients", type=int, nargs="*", default=list(MODELS), choices=list(MODELS))
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--timeout", type=float, default=60.0)
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    arguments.solvers = [name for name in SOLVERS if name not in PYTHON or os.environ.get(PYTHON[name])]
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    seconds = {}
-    for coefficients in arguments.coefficients:
+def _registered(coefficients: int) -> None:
+    @section("solver.md", f"{coefficients} coefficients", views=(15,), repeats=1)
+    def solvers(views: tuple[int, ...] = (15, 50, 200, 800), repeats: int = 3, timeout: float = 60.0) -> Iterator[str]:
         ratios = ["kcal / this"] if coefficients == 5 else ["kcal / this", "kcal, weak prior / this"]
-        lines = show(table(["views", "solver", "ms", *ratios, *COLUMN_NAMES], []))
-        for views in arguments.views:
-            found, seconds[views, coefficients] = compare(views, coefficients, arguments)
-            lines += show([row(*cells) for cells in found])
-        if coefficients in SECTIONS and arguments.write:
-            write_section("solver.md", SECTIONS[coefficients], lines)
-    show(growth(seconds))
+        rows = (cells for count in views for cells in compare(count, coefficients, repeats, timeout))
+        return table(["views", "solver", "ms", *ratios, *COLUMN_NAMES], rows)
 
 
-if __name__ == "__main__":
-    main()
+for _count in (5, 8, 14):
+    _registered(_count)

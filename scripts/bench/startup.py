@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import resource
 import shlex
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from typing import NamedTuple
 
 import kcal
 from kcal.cli.main import app
+from scripts.shared.timing import children_seconds
 
 LARGE = ("torch", "kornia", "cv2", "scipy", "scipy.stats", "skimage", "matplotlib", "pyproj", "jinja2")
 ROOT = Path(kcal.__file__).parents[1]
@@ -32,10 +32,9 @@ def measure(arguments: list[str], folder: Path, code: str = "try: main()") -> tu
     """CPU seconds of a command, its exit code, and which of the large libraries it loaded."""
     end = _END.format(names=set(LARGE))
     code = f"{_BEGIN}{code}\nfinally:{end.replace(chr(10), ' ')}" if code.startswith("try") else _BEGIN + code + end
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before = children_seconds()
     done = subprocess.run([sys.executable, "-c", code, *arguments], cwd=folder, capture_output=True, text=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    seconds = children_seconds() - before
     return seconds, done.returncode, sorted(done.stderr.splitlines()[-1].split())
 
 

@@ -1,29 +1,20 @@
 """Stations: time and memory of siting, of a frame of detections, of long tables, and of many cameras at once.
 
-    python -m scripts.bench.stations sites              # 200 x 200 points, 5 towers, 10 candidates; sites.png
-    python -m scripts.bench.stations frame [ROUNDS]     # 1,000 detections in 8 cameras
-    python -m scripts.bench.stations table [ROWS ...]   # kcal locate of long tables: CPU seconds and peak memory
-    python -m scripts.bench.stations two [PAIRS]        # Localizer beside Localizer
-    python -m scripts.bench.stations many [CAMERAS VIEWS ...]  # calibrated together: 8 and 24, 16 and 60
-
-`--write` puts a part into docs/measured/stations.md. CPU seconds on one core
-(time.process_time). `many` runs mrcal in the same loop where KCAL_MRCAL names an interpreter that has it: cameras in
-rows of four, 0.5 m apart, look at a board 4 m away, which all of them see; corners have 0.1 px of noise; lenses have
-five coefficients, kcal fits its default.
+CPU seconds on one core (time.process_time). `many` runs mrcal in the same loop where KCAL_MRCAL names an interpreter
+that has it: cameras in rows of four, 0.5 m apart, look at a board 4 m away, which all of them see; corners have 0.1 px
+of noise; lenses have five coefficients, kcal fits its default.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +30,10 @@ from kcal.locate import terrain
 from kcal.locate.siting import Site, area_of, rank_sites, siting_map
 from kcal.rig import planned_rig
 from scripts.shared.memory import peak_megabytes
-from scripts.shared.page import table, tell
+from scripts.shared.page import DOCS, table
+from scripts.shared.sections import section
 from scripts.shared.station_scenes import drawn_errors, hills, marks, ring, targets
-from scripts.shared.timing import show
+from scripts.shared.timing import children_seconds, show
 
 _CORNER, _CELL = (44.75, 5.72), 0.0014
 _TOWERS = (("mill", 44.9, 5.85), ("church", 45.1, 5.9), ("mast", 45.15, 6.15), ("hill", 44.87, 6.1), ("dam", 45.0, 6.0))
@@ -61,7 +53,8 @@ def _hilltop(ground: Tensor, name: str, lat: float, lon: float) -> Site:
     return Site(name=name, origin=Origin(lat=place[0], lon=place[1], height=float(near[i, j]) + 30.0))
 
 
-def sites() -> list[str]:
+@section("stations.md", "sites", cells=20)
+def sites(cells: int = 200, write: bool = False) -> Iterator[str]:
     """Time of a map and of the order of candidates, and the picture of the how-to page."""
     from kcal.report.figures import save_picture
     from kcal.report.positions import siting_figure
@@ -83,7 +76,7 @@ def sites() -> list[str]:
         rows.append([what, f"{time.process_time() - start:.2f}"])
         start = time.process_time()
 
-    area = area_of((44.8, 5.73, 45.25, 6.36), ground, [*towers, *candidates], cells=200, above=30.0)
+    area = area_of((44.8, 5.73, 45.25, 6.36), ground, [*towers, *candidates], cells=cells, above=30.0)
     lap(f"ground and {math.prod(area.known.shape):,} points, raster of {ground.cell_m:.0f} m")
     siting_map(area, towers)
     lap("map of 5 towers")
@@ -91,12 +84,14 @@ def sites() -> list[str]:
     lap("10 candidates, two of them chosen")
     rank_sites(area, towers, candidates)
     lap("10 candidates, all in order")
-    folder = str(Path(__file__).parents[2] / "docs" / "howto")
-    show([str(save_picture(Path(folder, "sites.png"), siting_figure(area, towers, ranked)))])
-    return [*table(["step", "CPU s"], rows), "", f"Peak memory {peak_megabytes():.0f} MB, libraries included."]
+    if write:
+        save_picture(DOCS.parent / "howto" / "sites.png", siting_figure(area, towers, ranked))
+    yield from table(["step", "CPU s"], rows)
+    yield from ["", f"Peak memory {peak_megabytes():.0f} MB, libraries included."]
 
 
-def frame(rounds: int) -> list[str]:
+@section("stations.md", "frame", rounds=1)
+def frame(rounds: int = 20) -> Iterator[str]:
     """Milliseconds of 1,000 detections in 8 cameras."""
     rig, generator = ring(8, 5000.0), torch.Generator().manual_seed(0)
     root = rig.with_errors(position_m=0.3, attitude_deg=(0.004, 0.004, 0.02), refraction=0.1)
@@ -119,7 +114,8 @@ def frame(rounds: int) -> list[str]:
     return table(["marks", "errors", "CPU ms a frame"], rows)
 
 
-def two(count: int) -> list[str]:
+@section("stations.md", "two", pairs=1000)
+def two(pairs: int = 200_000) -> Iterator[str]:
     """Two ways to weigh two cameras, on the same pairs of marks."""
     rows, generator = [], torch.Generator().manual_seed(0)
     for name, pose in (("marks alone", None), ("and lenses and pose", 1e-10 * torch.eye(6).double())):
@@ -128,10 +124,10 @@ def two(count: int) -> list[str]:
         if pose is not None:
             lens = 1e-4 * torch.eye(len(rig.left.names), dtype=torch.float64)
             rig.covariance = RigCovariance.of(rig, left=lens, right=lens, pose=pose)
-        far = 200.0 + 2800.0 * torch.rand(count, 1, generator=generator).double()
-        side = torch.randn(count, 2, generator=generator).double() * torch.tensor([0.15, 0.05]).double()
-        left, right = rig(far * torch.cat([side, torch.ones(count, 1).double()], 1))[0].unbind(-2)
-        marked = torch.stack([left, right], 1) + 0.2 * torch.randn(count, 2, 2, generator=generator).double()
+        far = 200.0 + 2800.0 * torch.rand(pairs, 1, generator=generator).double()
+        side = torch.randn(pairs, 2, generator=generator).double() * torch.tensor([0.15, 0.05]).double()
+        left, right = rig(far * torch.cat([side, torch.ones(pairs, 1).double()], 1))[0].unbind(-2)
+        marked = torch.stack([left, right], 1) + 0.2 * torch.randn(pairs, 2, 2, generator=generator).double()
         with torch.no_grad():
             (ours, by_pair), (theirs, by_views) = (
                 _timed(Localizer(rig, pixel_sigma=0.2, refraction_sigma=0.0), marked[:, 0], marked[:, 1]),
@@ -140,7 +136,7 @@ def two(count: int) -> list[str]:
         both = (ours.status == 0) & (theirs.status == 0)
         sigma = ours.covariance[both].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
         off = (ours.enu - theirs.enu)[both].norm(dim=-1) / sigma
-        each = 1e6 / count
+        each = 1e6 / pairs
         rows.append([
             name, f"{by_pair * each:.2f}", f"{by_views * each:.1f}", f"{by_views / by_pair:.1f}",
             f"{float(off.median()):.1e}",
@@ -158,7 +154,8 @@ def _timed(localize: torch.nn.Module, *marked: Tensor) -> tuple[Any, float]:
     return localize(*marked), time.process_time() - start
 
 
-def long_tables(sizes: Sequence[int]) -> list[str]:
+@section("stations.md", "table", sizes=(300,))
+def long_tables(sizes: tuple[int, ...] = (100_000, 1_000_000)) -> Iterator[str]:
     """CPU seconds and peak memory of `kcal locate` of marks of three cameras, in a process of its own."""
     rig, rows = ring(3, 5000.0), []
     rig.root = rig.with_errors(attitude_deg=0.01)
@@ -178,19 +175,29 @@ def long_tables(sizes: Sequence[int]) -> list[str]:
                 "try: app(sys.argv[1:])\nexcept SystemExit: pass\nprint('peak', peak_megabytes(), file=sys.stderr)"
             )
             words = ["locate", "rig.json", "marks.csv", "-o", "out.csv", "--json"]
-            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            before = children_seconds()
             done = subprocess.run([sys.executable, "-c", code, *words], cwd=folder, capture_output=True, text=True)
-            after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+            spent = children_seconds() - before
             peak = float(done.stderr.split("peak ")[-1])
             with Path(folder, "out.csv").open() as file:
                 lines = sum(1 for _ in file) - 1
             rows.append([f"{3 * things:,}", f"{lines:,}", f"{spent:.0f}", f"{peak:.0f}"])
-            show([str(rows[-1])])
     return table(["lines", "positions", "CPU s", "peak MB"], rows)
 
 
-def many(cameras: int, views: int) -> list[list[str]]:
+@section("stations.md", "many", sizes=(2, 4))
+def many(sizes: tuple[int, ...] = (8, 24, 16, 60)) -> Iterator[str]:
+    """Rigs of CAMERAS VIEWS, CAMERAS VIEWS...; the smallest first, as memory is told by its peak."""
+    rows = (
+        [f"{cameras} x {views}", *row]
+        for cameras, views in zip(sizes[::2], sizes[1::2], strict=True)
+        for row in together(cameras, views)
+    )
+    heads = ["cameras x views", "program", "CPU s", "of it one by one", "peak MB", "RMS error of centers mm"]
+    return table([*heads, "after the best-fit rotation of all", "of attitudes °"], rows)
+
+
+def together(cameras: int, views: int) -> Iterator[list[str]]:
     """Cameras calibrated together, beside mrcal where it is."""
     generator = torch.Generator().manual_seed(0)
 
@@ -217,7 +224,6 @@ def many(cameras: int, views: int) -> list[list[str]]:
         if bool(seen.all()):
             moments.append((pixels + _NOISE_PX * draw(*pixels.shape)).movedim(1, 0))
     corners = torch.stack(moments)  # (V, C, N, 2)
-    rows = []
     start = time.process_time()
     observed = {
         c: Observations(board=board, image_size=(1920, 1080), views=tuple(
@@ -226,14 +232,16 @@ def many(cameras: int, views: int) -> list[list[str]]:
     }  # fmt: skip
     calibrated = tuple(calibrate_camera(one).camera for one in observed.values())
     alone = time.process_time() - start
-    show([f"one by one: {alone:.0f} s"])
     data = RigData(cameras=calibrated, names=rig.names, boards=boards_of_several(calibrated, rig.names, observed))
     found = solve_rig(data)
     spent = time.process_time() - start
-    rows.append(
-        ["kcal", f"{spent:.0f}", f"{alone:.0f}", f"{peak_megabytes():.0f}", *_errors(rig, found.rotation, found.center)]
-    )
-    show([str(rows[-1])])
+    yield [
+        "kcal",
+        f"{spent:.0f}",
+        f"{alone:.0f}",
+        f"{peak_megabytes():.0f}",
+        *_errors(rig, found.rotation, found.center),
+    ]
     if python := os.environ.get("KCAL_MRCAL"):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "problem.npz")
@@ -248,17 +256,7 @@ def many(cameras: int, views: int) -> list[list[str]]:
             else:
                 other = json.loads(done.stdout.splitlines()[-1])
                 poses = (torch.tensor(other[name], dtype=torch.float64) for name in ("rotation", "center"))
-                rows.append(
-                    ["mrcal, OPENCV8", f"{other['cpu']:.0f}", "", f"{other['peak']:.0f}", *_errors(rig, *poses)]
-                )
-    return [[f"{cameras} x {views}", *row] for row in rows]
-
-
-def several_rigs(counts: Sequence[int]) -> list[str]:
-    """Rigs of CAMERAS VIEWS, CAMERAS VIEWS...; the smallest first, as memory is told by its peak."""
-    rows = [row for pair in zip(counts[::2], counts[1::2], strict=True) for row in many(*pair)]
-    heads = ["cameras x views", "program", "CPU s", "of it one by one", "peak MB", "RMS error of centers mm"]
-    return table([*heads, "after the best-fit rotation of all", "of attitudes °"], rows)
+                yield ["mrcal, OPENCV8", f"{other['cpu']:.0f}", "", f"{other['peak']:.0f}", *_errors(rig, *poses)]
 
 
 def _errors(rig: Rig, rotation: Tensor, center: Tensor) -> list[str]:
@@ -273,26 +271,3 @@ def _errors(rig: Rig, rotation: Tensor, center: Tensor) -> list[str]:
     turned = own_turn @ true_turn.mT
     angle = ((turned.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1).arccos()[1:].square().mean().sqrt()
     return [f"{1e3 * float(off):.3f}", f"{1e3 * float(off_shape):.3f}", f"{math.degrees(float(angle)):.5f}"]
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one part."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("sites", "frame", "table", "two", "many"))
-    parser.add_argument("counts", nargs="*", type=int)
-    parser.add_argument("--write", action="store_true")
-    given = parser.parse_args(arguments)
-    torch.set_num_threads(1)
-    parts: dict[str, Callable[[], list[str]]] = {
-        "sites": sites,
-        "frame": lambda: frame(*(given.counts or [20])),
-        "table": lambda: long_tables(given.counts or [100_000, 1_000_000]),
-        "two": lambda: two(*(given.counts or [200_000])),
-        "many": lambda: several_rigs(given.counts or [8, 24, 16, 60]),
-    }
-    lines = parts[given.part]()
-    tell("stations.md", given.part, lines, write=given.write)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,12 +1,5 @@
 """The default camera against ray-traced lenses: error at infinity, and whether its error bars hold.
 
-    python -m scripts.bench.traced_lenses --out cells.jsonl --lens webcam  # cells that the file holds are kept
-    python -m scripts.bench.traced_lenses --out *.jsonl --write            # the tables in docs/measured
-    python -m scripts.bench.traced_lenses --out sigmas.jsonl --models hybrid --views 60 30 --noise .03 .1 .2 \
-        --seeds $(seq 200 211)                                             # error bars alone; --write-sigmas
-    python -m scripts.bench.traced_lenses --out apart.jsonl --apart --models hybrid --noise .02 .1 .3 \
-        --seeds $(seq 300 339)                                             # likewise, each with views of its own
-
 Truth: three lenses of `kcal.sim.raytrace`, decentered by their tolerances, whose entrance pupil moves as in life
 (`wander` 1); views of the paper's board (6 x 7 corners, 5 cm), exact or printed (stretch 0.15 %, shear 0.02 %,
 bent along an oblique axis by 0.7 mm, smooth errors of 0.03 mm), with Gaussian corner noise. Measure: how far from the
@@ -15,21 +8,17 @@ often the truth lies in the hybrid's 95 % ellipses, on a grid of the image, wher
 error that its covariance predicts, over the true one. Places of one capture are in or out together, and captures of one
 seed that share poses, and noise but for its size and order, nearly so: --apart gives each its own, and shares are told
 with the standard error between seeds. Parametric models are fitted as `calibrate_camera` does by default, with the
-board's warp.
-
-Seeds below 100 were used for tuning the hybrid; the tables use those given by --seeds.
+board's warp. Seeds below 100 were used for tuning the hybrid.
 """
 
 from __future__ import annotations
 
-import argparse
+import functools
 import itertools
-import json
 import math
 import statistics
 import time
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -40,31 +29,31 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.lens import pixel_covariance
 from kcal.sim.captures import LensLike, drawn_lens
 from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
 from scripts.shared.prescriptions import PRESCRIPTIONS
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import quick
-from scripts.shared.timing import show
+from scripts.shared.timing import share
 from scripts.shared.traced import BOARD, capture, captures, printed
 
 LENSES = ("webcam", "machine-vision", "surveillance")
 SIGMAS = (0.02, 0.05, 0.1, 0.3)
 SHOWN = 0.1  # px of noise of the cells that the page shows; means are over all
 VIEWS = (60, 30, 8)
-BOARDS = ("exact", "printed")
+BOARDS: tuple[str, ...] = ("exact", "printed")
 MODELS = {
     "hybrid": CalibrationOptions(),
     "opencv5": CalibrationOptions(model="opencv5", board_warp=True),
     "opencv14": CalibrationOptions(model="opencv14", board_warp=True),
     "ext20": CalibrationOptions(model="ext20", board_warp=True),
 }
-PAGE = "one-camera.md"
 # Squared distance that a normal vector of two components exceeds once in twenty times.
 CHI2 = -2.0 * math.log(0.05)
 
 
-def cells(
-    name: str, board: str, views: int, sigmas: list[float], seed: int, models: list[str], apart: bool
-) -> Iterator[dict[str, Any]]:
+def cell(
+    name: str, board: str, views: int, seed: int, *, sigmas: Sequence[float], models: Sequence[str], apart: bool
+) -> Record:
     """Models on captures of one lens that differ in their noise alone, or in poses and noise."""
     lens = drawn_lens(PRESCRIPTIONS[name], 1.0, seed, wander=1.0)
     points = BOARD.points if board == "exact" else printed(BOARD.points, seed)
@@ -73,13 +62,26 @@ def cells(
         if apart
         else captures(lens, views, sigmas, 1000 + seed, points)
     )
-    for sigma, seen in zip(sigmas, drawn, strict=True):
-        for model in models:
-            head = {"lens": name, "board": board, "views": views, "sigma": sigma, "seed": seed, "model": model}
-            yield head | measured(lens, seen, MODELS[model])
+    head = {"lens": name, "board": board, "views": views, "seed": seed}
+    fits = [
+        head | {"sigma": sigma, "model": model} | measured(lens, seen, MODELS[model])
+        for sigma, seen in zip(sigmas, drawn, strict=True)
+        for model in models
+    ]
+    return {"fits": fits}
 
 
-def measured(lens: LensLike, seen: Observations, options: CalibrationOptions) -> dict[str, Any]:
+def fits_of(
+    kept: Kept, seeds: range, lenses: tuple[str, ...], views: tuple[int, ...], noise: tuple[float, ...],
+    models: tuple[str, ...], apart: bool,
+) -> list[Record]:  # fmt: skip
+    """Every fit of every capture."""
+    keys = [(name, board, count, seed) for seed, name, board, count in itertools.product(seeds, lenses, BOARDS, views)]
+    work = functools.partial(cell, sigmas=noise, models=models, apart=apart)
+    return [fit for record in kept.records(keys, work) for fit in record["fits"]]
+
+
+def measured(lens: LensLike, seen: Observations, options: CalibrationOptions) -> Record:
     """One calibration against the truth."""
     start = time.process_time()
     try:
@@ -88,7 +90,7 @@ def measured(lens: LensLike, seen: Observations, options: CalibrationOptions) ->
         error = error_at_infinity(result.camera, lens)
     except KcalError as refusal:
         return {"rms": math.inf, "failed": str(refusal)}
-    record: dict[str, Any] = {"rms": error.rms, "cpu_s": spent, "valid": error.valid, "noise": result.noise}
+    record: Record = {"rms": error.rms, "cpu_s": spent, "valid": error.valid, "noise": result.noise}
     if result.hybrid is None:
         return record
     covariance = pixel_covariance(result.camera, error.pixels.reshape(-1, 2))
@@ -106,8 +108,12 @@ def measured(lens: LensLike, seen: Observations, options: CalibrationOptions) ->
     }
 
 
-def tables(records: list[dict[str, Any]]) -> list[str]:
-    """The page's tables."""
+@section("one-camera.md", "traced", seeds=range(200, 201), lenses=LENSES[:1], views=(8,), noise=(0.1,))
+def traced(
+    kept: Kept = NOT_KEPT, seeds: range = range(200, 203), lenses: tuple[str, ...] = LENSES,
+    views: tuple[int, ...] = VIEWS, noise: tuple[float, ...] = SIGMAS,
+) -> list[str]:  # fmt: skip
+    records = fits_of(kept, seeds, lenses, views, noise, tuple(MODELS), False)
     cells: dict[tuple[Any, ...], dict[str, list[float]]] = {}
     for r in records:
         key = (r["lens"], r["board"], r["views"], r["sigma"])
@@ -115,15 +121,15 @@ def tables(records: list[dict[str, Any]]) -> list[str]:
     means, rows = [], []
     for board in BOARDS:
         ratios = []
-        for name, views, sigma in itertools.product(LENSES, VIEWS, SIGMAS):
-            found = cells.get((name, board, views, sigma))
+        for name, count, sigma in itertools.product(LENSES, VIEWS, SIGMAS):
+            found = cells.get((name, board, count, sigma))
             if not found:
                 continue
             typical = {model: math.exp(statistics.fmean(map(math.log, values))) for model, values in found.items()}
             ratio = typical["hybrid"] / min(value for model, value in typical.items() if model != "hybrid")
             ratios.append(ratio)
             if sigma == SHOWN:
-                rows.append([board, name, views, *(f"{typical[m]:.3f}" for m in MODELS), f"{ratio:.2f}"])
+                rows.append([board, name, count, *(f"{typical[m]:.3f}" for m in MODELS), f"{ratio:.2f}"])
         if ratios:
             mean = math.exp(statistics.fmean(map(math.log, ratios)))
             means.append(f"{board} boards: geometric mean {mean:.2f}, worst {max(ratios):.2f}")
@@ -136,7 +142,7 @@ def tables(records: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-def coverage_table(records: list[dict[str, Any]]) -> list[str]:
+def coverage_table(records: list[Record]) -> list[str]:
     """How often the truth is inside the hybrid's ellipses."""
     rows = []
     for board, name in itertools.product(BOARDS, LENSES):
@@ -148,21 +154,23 @@ def coverage_table(records: list[dict[str, Any]]) -> list[str]:
     return [f"Truth inside the 95 % ellipses of the hybrid, seeds {seeds}:", "", *table(header, rows)]
 
 
-def between_seeds(records: list[dict[str, Any]], key: str) -> str:
+def between_seeds(records: list[Record], key: str) -> str:
     """Mean of a share in percent, with the standard error that its means of each seed tell."""
     seeds: dict[int, list[float]] = {}
     for r in records:
         if r[key] == r[key]:
-            seeds.setdefault(r["seed"], []).append(100.0 * r[key])
-    means = [statistics.fmean(values) for values in seeds.values()]
-    if len(means) < 2:
-        return "–"
-    return f"{statistics.fmean(means):.1f} ± {statistics.stdev(means) / math.sqrt(len(means)):.1f} %"
+            seeds.setdefault(r["seed"], []).append(r[key])
+    return share(map(statistics.fmean, seeds.values()), " %")
 
 
-def sigma_tables(records: list[dict[str, Any]]) -> list[str]:
-    """Predicted errors of the hybrid over true ones, and its coverage."""
-    cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+@section("one-camera.md", "sigmas", seeds=range(200, 202), lenses=LENSES[:1], views=(8,), noise=(0.1,))
+def sigmas(
+    kept: Kept = NOT_KEPT, seeds: range = range(200, 212), lenses: tuple[str, ...] = LENSES,
+    views: tuple[int, ...] = (60, 30), noise: tuple[float, ...] = (0.03, 0.1, 0.2), apart: bool = False,
+) -> list[str]:  # fmt: skip
+    """Predicted errors of the hybrid over true ones, and its coverage; `apart`: each noise has views of its own."""
+    records = fits_of(kept, seeds, lenses, views, noise, ("hybrid",), apart)
+    cells: dict[tuple[Any, ...], list[Record]] = {}
     for r in records:
         if "predicted" in r:
             cells.setdefault((r["lens"], r["board"], r["views"], r["sigma"]), []).append(r)
@@ -177,36 +185,3 @@ def sigma_tables(records: list[dict[str, Any]]) -> list[str]:
         "",
         *coverage_table(records),
     ]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", nargs="+", type=Path, required=True, help="JSON lines; the first is written to")
-    parser.add_argument("--lens", choices=LENSES, help="only this one")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[200, 201, 202])
-    parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
-    parser.add_argument("--views", nargs="+", type=int, default=list(VIEWS))
-    parser.add_argument("--noise", nargs="+", type=float, default=list(SIGMAS), help="px")
-    parser.add_argument("--apart", action="store_true", help="each noise has views of its own")
-    parser.add_argument("--write", action="store_true", help="write the tables into the page")
-    parser.add_argument("--write-sigmas", action="store_true", help="write those of the error bars alone")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    records = [json.loads(line) for path in arguments.out if path.exists() for line in path.read_text().splitlines()]
-    if arguments.write or arguments.write_sigmas:
-        section, lines = ("traced", tables(records)) if arguments.write else ("sigmas", sigma_tables(records))
-        write_section(PAGE, section, lines)
-        return
-    done = {(r["lens"], r["board"], r["views"], r["sigma"], r["seed"]) for r in records}
-    names = (arguments.lens,) if arguments.lens else LENSES
-    for seed, name, board, views in itertools.product(arguments.seeds, names, BOARDS, arguments.views):
-        left = [sigma for sigma in arguments.noise if (name, board, views, sigma, seed) not in done]
-        for record in cells(name, board, views, left, seed, arguments.models, arguments.apart) if left else ():
-            print(json.dumps(record)[:200], flush=True)
-            with arguments.out[0].open("a") as file:
-                file.write(json.dumps(record) + "\n")
-    show(sigma_tables([json.loads(line) for line in arguments.out[0].read_text().splitlines()]))
-
-
-if __name__ == "__main__":
-    main()

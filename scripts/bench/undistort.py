@@ -1,10 +1,5 @@
 """Undistortion of 1080p images: kcal beside `cv2.remap` and kornia's `undistort_image`, eager, on the CPU.
 
-    python -m scripts.bench.undistort [--quick]
-    python -m scripts.bench.undistort --views --write    # the table of kinds of rectification, in CPU time
-
-`scripts/bench/lens.py` puts the first table into docs/measured/lens.md.
-
 One image, one lens of 8 coefficients. The maps of kcal and OpenCV are made beforehand, as one would for a video;
 kornia's function has no way to keep them. All three keep the source's intrinsics. In each round every side runs once,
 in turn, and ratios are taken within a round; medians, one thread.
@@ -12,10 +7,9 @@ in turn, and ratios are taken within a round; medians, one thread.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
@@ -25,8 +19,9 @@ from kornia.geometry.calibration import undistort_image
 from kcal import Camera, Rig
 from kcal.lens import cylinder_view, looking, pinhole_view
 from kcal.lens.images import StereoRectification, Undistort, UndistortMaps, undistort_maps
-from scripts.shared.page import write_section
-from scripts.shared.timing import median, ratio, row, show, times
+from scripts.shared.page import table
+from scripts.shared.sections import section
+from scripts.shared.timing import median, ratio, times
 
 SIZE = (1920, 1080)
 LENS = [-0.28, 0.1, 1e-3, -1e-3, 0.02, 0.05, 0.02, 0.01]
@@ -39,24 +34,14 @@ CASES = (
 )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="3 rounds in place of 30")
-    parser.add_argument("--views", action="store_true", help="kinds of rectification, milliseconds a megapixel")
-    parser.add_argument("--write", action="store_true", help="with --views: write the table into docs/measured/lens.md")
-    arguments = parser.parse_args()
-    rounds = 3 if arguments.quick else 30
-    if not arguments.views:
-        tables(rounds)
-        return
-    lines = views(rounds)
-    write_section("lens.md", "rectification", lines, write=arguments.write)
+@section("lens.md", "rectification", rounds=1)
+def views(rounds: int = 30) -> Iterator[str]:
+    heads = ["view", "maps, once", "float32, color", "`cv2.remap`", "uint8, color", "`cv2.remap`"]
+    return table(heads, view_rows(rounds))
 
 
-def views(rounds: int) -> list[str]:
-    """Print the table of kinds of rectification, in CPU milliseconds a megapixel of the new image."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+def view_rows(rounds: int) -> Iterator[list[object]]:
+    """Kinds of rectification, in CPU milliseconds a megapixel of the new image."""
     camera = Camera.build(focal=(1400, 1400), center=(957, 541), size=SIZE, coefficients=LENS, model="opencv8")
     fisheye = Camera.build(focal=(600, 600), center=(957, 541), size=SIZE, coefficients=[0.02], model="fisheye4")
     turn = looking(1.0, 0.5)
@@ -67,9 +52,6 @@ def views(rounds: int) -> list[str]:
         ("fisheye on a cylinder", lambda: [Undistort(fisheye, cylinder_view(fisheye))]),
         ("stereo pair", lambda: [getattr(StereoRectification(rig), side) for side in ("left", "right")]),
     ]
-    lines = show([
-        row("view", "maps, once", "float32, color", "`cv2.remap`", "uint8, color", "`cv2.remap`"), row(*["---"] * 6),
-    ])  # fmt: skip
     for name, make in kinds:
         start = time.process_time()
         modules = make()
@@ -92,29 +74,19 @@ def views(rounds: int) -> list[str]:
                         call()
                     taken.append(1e3 * (time.process_time() - start) / pixels)
                 cells.append(median(taken))
-        lines += show([row(name, *cells)])
-    return lines
+        yield [name, *cells]
 
 
-def tables(rounds: int) -> list[str]:
-    """Print the table and return its lines."""
+@section("lens.md", "images", rounds=1)
+def images(rounds: int = 30) -> Iterator[str]:
     camera = Camera.build(focal=(1400, 1400), center=(957, 541), size=SIZE, coefficients=LENS, model="opencv8")
     new = Camera.build(focal=(1400, 1400), center=(957, 541), size=SIZE, model="pinhole")
     milliseconds = _milliseconds(times([lambda: undistort_maps(camera, new)], 3)[0])
     print(f"Making kcal's maps, once for each camera: {milliseconds} ms.")
-    lines = show(
-        [
-            "| image | kcal, maps kept | `cv2.remap` | kornia `undistort_image` | cv2 / kcal | kornia / kcal "
-            "| largest difference to cv2, levels of 255 |",
-            "|---|---|---|---|---|---|---|",
-        ]
-    )
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    heads = ["image", "kcal, maps kept", "`cv2.remap`", "kornia `undistort_image`", "cv2 / kcal", "kornia / kcal"]
     undistort = Undistort(camera, new)
-    for name, channels, dtype in CASES:
-        lines += show([_row(name, camera, undistort, _image(channels, dtype), rounds)])
-    return lines
+    rows = (_row(name, camera, undistort, _image(channels, dtype), rounds) for name, channels, dtype in CASES)
+    return table([*heads, "largest difference to cv2, levels of 255"], rows)
 
 
 def _each(modules: list[Undistort], image: torch.Tensor) -> list[object]:
@@ -135,7 +107,7 @@ def _image(channels: int, dtype: torch.dtype) -> torch.Tensor:
 
 
 @torch.no_grad()
-def _row(name: str, camera: Camera, undistort: Undistort, image: torch.Tensor, rounds: int) -> str:
+def _row(name: str, camera: Camera, undistort: Undistort, image: torch.Tensor, rounds: int) -> list[object]:
     maps = undistort_maps(undistort.camera, undistort.new_camera)
     # OpenCV's images have their channels last.
     array = np.ascontiguousarray(image[0].permute(1, 2, 0).squeeze(-1).numpy())
@@ -150,14 +122,10 @@ def _row(name: str, camera: Camera, undistort: Undistort, image: torch.Tensor, r
     faster = [ratio(found[0], other) for other in found[1:]]
     theirs = torch.from_numpy(np.atleast_3d(cv2.remap(array, maps.map_x, maps.map_y, cv2.INTER_LINEAR)))
     difference = float((undistort(image)[0][0].double() - theirs.permute(2, 0, 1).double()).abs().max())
-    cells = [name, *(_milliseconds(t) for t in found), *["–"] * (3 - len(found))]
+    cells: list[object] = [name, *(_milliseconds(t) for t in found), *["–"] * (3 - len(found))]
     cells += [*faster, *["–"] * (2 - len(faster)), f"{difference:.3f}"]
-    return row(*cells)
+    return cells
 
 
 def _milliseconds(seconds: list[float]) -> str:
     return median([1e3 * value for value in seconds])
-
-
-if __name__ == "__main__":
-    main()

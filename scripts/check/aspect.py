@@ -1,30 +1,24 @@
 """Is it said that pixels are not square, where they are and where they are not?
 
-    python -m scripts.check.aspect --out FILE --seeds 0-999                  # square pixels: false alarms
-    python -m scripts.check.aspect --out FILE --seeds 0-199 --stretch 1.01   # rows longer or shorter by 1 %, in turn
-    python -m scripts.check.aspect --out FILE [OTHER ...] --write            # the table of docs/measured/ordinary.md
-
-Captures that FILE has are not made again. Truth: traced lenses in turn and printed boards, as in
-`scripts.check.captures_that_move`; 8 to 20 views, 0.05 to 0.2 px of noise; boards upright (within 2 degrees) in half
-of the captures, turned by up to 90 degrees in the others; a quarter of the captures by hand. A camera is said to have
-pixels that are not square if a warning of its calibration contains "pixels are not square".
+`--stretch 1.01`: rows longer or shorter by 1 %, in turn; 1 shows false alarms. Truth: traced lenses in turn and printed
+boards, as in `scripts.check.captures_that_move`; 8 to 20 views, 0.05 to 0.2 px of noise; boards upright (within 2
+degrees) in half of the captures, turned by up to 90 degrees in the others; a quarter of the captures by hand. A camera
+is said to have pixels that are not square if a warning of its calibration contains "pixels are not square".
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
-from pathlib import Path
+from collections.abc import Iterator
 
 import torch
 
 from kcal import KcalError, calibrate_camera
-from scripts.shared.page import table, tell
-from scripts.shared.records import Record, finish, read, seeds
+from scripts.shared.page import table
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import simulated
 
-PAGE = "ordinary.md"
 SAID = "pixels are not square"
 VIEWS, NOISE, UPRIGHT, ROLLED = (8, 20), (0.05, 0.2), math.radians(2.0), math.radians(90.0)
 
@@ -49,14 +43,7 @@ def judged(stretch: float, seed: int) -> Record:
     return record | {"said": said, "aspect": focal[1] / focal[0], "cpu_s": time.process_time() - start}
 
 
-def line(record: Record) -> str:
-    """One line to print."""
-    if "refused" in record:
-        return f"refused: {record['refused'][:90]}"
-    return f"true {record['factor']:.4f}, found {record['aspect']:.4f}, {record['said'] or 'nothing said'}"
-
-
-def lines(records: list[Record]) -> list[str]:
+def lines(records: list[Record]) -> Iterator[str]:
     """A row for each stretch and kind of capture."""
     rows = []
     for stretch in sorted({record["key"][0] for record in records}):
@@ -79,17 +66,6 @@ def lines(records: list[Record]) -> list[str]:
     return table(head, rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", nargs="+", type=Path, required=True, help="JSON lines; the first is written to")
-    parser.add_argument("--seeds", type=seeds, help="for example 0-999")
-    parser.add_argument("--stretch", type=float, default=1.0, help="of the rows, or its inverse, in turn")
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    if arguments.seeds is not None:
-        finish(arguments.out[0], [(arguments.stretch, seed) for seed in arguments.seeds], judged, line)
-    tell(PAGE, "aspect", lines(read(arguments.out)), write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+@section("ordinary.md", "aspect", seeds=range(1))
+def of_pixels(kept: Kept = NOT_KEPT, seeds: range = range(1000), stretch: float = 1.0) -> Iterator[str]:
+    return lines(kept.records([(stretch, seed) for seed in seeds], judged))

@@ -1,9 +1,5 @@
 """Boards whose corners are off their places one by one: found, true, and what they do to the camera.
 
-    python -m scripts.check.board_corners --out FILE --seeds 0-99              # simulated boards
-    KCAL_DATA=DATA python -m scripts.check.board_corners --out FILE --real     # captures by two cameras of one board
-    python -m scripts.check.board_corners --out FILE --write                   # the tables of one-camera.md
-
 Simulated: the traced lenses of `scripts.shared.simulated`, on a stand. Boards are exact, printed
 (`PrintedBoard`), or printed with each corner off by 0.03 mm in x and y (standard deviation). *Smooth*: without the
 term for single corners. Real: a camera is fitted to either half of its views with a board of smooth errors alone
@@ -13,15 +9,13 @@ views, held (*other's*). The other half is then predicted: poses are refitted, b
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import itertools
 import math
 import statistics
-import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -31,13 +25,13 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import moving_residuals
 from kcal.sim.captures import BoardLike, BoardSize, PrintedBoard
-from scripts.check.captures_that_move import rms, share
-from scripts.shared.page import table, tell
-from scripts.shared.real_captures import data_folder, load
-from scripts.shared.records import Record, finish, read, seeds
+from scripts.shared.page import table
+from scripts.shared.real_captures import load
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import BOARD, against_truth, simulated
+from scripts.shared.timing import rms, share
 
-PAGE, NOISES, OFF, VIEWS = "one-camera.md", (0.08,), 3e-5, (8, 30)
+NOISES, OFF, VIEWS = (0.08,), 3e-5, (8, 30)
 SIZE = BOARD.columns, BOARD.rows, BOARD.square
 PAIRS = (("st1_l", "st1_r"), ("gavin_l", "gavin_r"), ("stereo_left", "stereo_right"))
 
@@ -91,9 +85,9 @@ def predicted(fit: HybridFit, whole: HybridFit, seen: Observations, views: list[
     return float(left.square().sum(-1).nanmean().sqrt())
 
 
-def real(name: str, other: str, cache: Path) -> Record:
+def real(_: str, name: str, other: str) -> Record:
     """One camera of a pair."""
-    seen, theirs = (load(each, data_folder(), cache).seen for each in (name, other))
+    seen, theirs = (load(each).seen for each in (name, other))
     whole, own, told = fitted(seen, False), fitted(seen, True), fitted(theirs, True)
     record: Record = {"sigma": [whole.sigma, own.sigma], "rms": {"smooth": whole.rms, "default": own.rms}}
     if own.displaced is None or told.displaced is None:
@@ -115,7 +109,7 @@ def real(name: str, other: str, cache: Path) -> Record:
     return record
 
 
-def simulated_lines(records: list[Record]) -> list[str]:
+def simulated_lines(records: list[Record]) -> Iterator[str]:
     """A row for each kind of board, number of views and fit."""
     rows, cells = [], dict[tuple[str, float, int], list[Record]]()
     for record in records:
@@ -127,7 +121,8 @@ def simulated_lines(records: list[Record]) -> list[str]:
             true, stated = [record["rms"] for record in known], [record["predicted"] for record in known]
             rows.append([
                 views, noise, kind, fit, len(own), f"{100 * found:.0f} %" if fit == "default" else "–",
-                share(known, "everywhere"), f"{statistics.median(true):.3f}", f"{rms(true):.3f}", f"{rms(stated):.3f}",
+                share(one["everywhere"] for one in known),
+                f"{statistics.median(true):.3f}", f"{rms(true):.3f}", f"{rms(stated):.3f}",
                 f"{statistics.fmean(record['cpu_s'] for record in known):.2f}",
             ])  # fmt: skip
     head = [
@@ -137,7 +132,7 @@ def simulated_lines(records: list[Record]) -> list[str]:
     return table(head, rows)
 
 
-def real_lines(records: list[Record]) -> list[str]:
+def real_lines(records: list[Record]) -> Iterator[str]:
     """A row for each camera."""
     rows = []
     for record in records:
@@ -153,45 +148,19 @@ def real_lines(records: list[Record]) -> list[str]:
     return table(head, rows)
 
 
-def line(record: Record) -> str:
-    """One line to print."""
-    if "rms" in record:
-        return str(record)
-    told = [
-        f"{name} {one.get('rms', math.nan):.3f} {one.get('terms')}" for name, one in record.items() if name != "key"
+@section("one-camera.md", "board-corners", seeds=range(1), views=(8,))
+def of_simulated(
+    kept: Kept = NOT_KEPT, seeds: range = range(100), boards: tuple[str, ...] = ("exact", "corners"),
+    views: tuple[int, ...] = VIEWS, noises: tuple[float, ...] = NOISES,
+) -> Iterator[str]:  # fmt: skip
+    keys = [
+        (board, noise, count, seed) for seed, board, noise, count in itertools.product(seeds, boards, noises, views)
     ]
-    return ", ".join(told)
+    return simulated_lines(kept.records(keys, simulation))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", nargs="+", type=Path, required=True, help="JSON lines; the first is written to")
-    parser.add_argument("--seeds", type=seeds, help="for example 0-99")
-    parser.add_argument("--kinds", nargs="+", choices=("exact", "printed", "corners"), default=["exact", "corners"])
-    parser.add_argument("--views", nargs="+", type=int, default=VIEWS)
-    parser.add_argument("--noises", nargs="+", type=float, default=NOISES, help="pixels")
-    parser.add_argument("--real", action="store_true", help="the pairs of cameras in KCAL_DATA")
-    parser.add_argument(
-        "--cache",
-        type=Path,
-        default=Path(tempfile.gettempdir(), "kcal-ordinary-corners"),
-        help="corners found in images",
-    )
-    parser.add_argument("--write", action="store_true", help="write the tables into the page")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    if arguments.seeds is not None:
-        keys = [*itertools.product(arguments.kinds, arguments.noises, arguments.views, arguments.seeds)]
-        finish(arguments.out[0], sorted(keys, key=lambda key: int(str(key[3]))), simulation, line)
-    if arguments.real:
-        pairs = [("real", *names) for pair in PAIRS for names in (pair, pair[::-1])]
-        finish(arguments.out[0], pairs, lambda _, one, other: real(one, other, arguments.cache), line)
-    records = read(arguments.out)
-    for section, is_real, text in (("board-corners-real", True, real_lines), ("board-corners", False, simulated_lines)):
-        own = [record for record in records if (record["key"][0] == "real") is is_real]
-        if own:
-            tell(PAGE, section, text(own), write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+@section("one-camera.md", "board-corners-real", pairs=("stereo_left",))
+def of_real(kept: Kept = NOT_KEPT, pairs: tuple[str, ...] = tuple(pair[0] for pair in PAIRS)) -> Iterator[str]:
+    """The pairs of cameras in KCAL_DATA that begin with these."""
+    keys = [("real", *names) for pair in PAIRS if pair[0] in pairs for names in (pair, pair[::-1])]
+    return real_lines(kept.records(keys, real))

@@ -1,7 +1,5 @@
 """Bundle adjustment in COLMAP and in GTSAM with kcal's prior, with free intrinsics and with fixed ones; truth known.
 
-    python -m scripts.check.bundle_adjustment [--seeds 0-9] [--write]
-
 A traced lens or an `opencv4` lens is calibrated by kcal from eight simulated views of a board, and exported to each
 program. Two scenes of 150 points 50 m away, marked within 0.5 px in eight images: "strip", parallel views down at a
 relief of 5 m, which hardly determine focal length and radial terms; and "ring", views from all around, which do. The
@@ -12,10 +10,9 @@ gtsam. Snippets of docs/howto/bundle-adjustment.md do the work, as they stand th
 
 from __future__ import annotations
 
-import argparse
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,8 +22,8 @@ import torch
 from kcal import Camera, calibrate_camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions
 from kcal.lens import export_cameras
-from scripts.shared.page import table, tell
-from scripts.shared.records import seeds
+from scripts.shared.page import table
+from scripts.shared.sections import section
 from scripts.shared.simulated import simulated
 from scripts.shared.views import observed, simulate
 
@@ -220,14 +217,11 @@ def cases(seed: int) -> dict[str, tuple[Project, Camera]]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=seeds, default=seeds("0-9"))
-    parser.add_argument("--write", action="store_true", help="write the table into docs/measured/other-programs.md")
-    args = parser.parse_args()
+@section("other-programs.md", "bundle adjustment", seeds=range(1))
+def bundle_adjustment(seeds: range = range(10)) -> Iterator[str]:
     found: dict[tuple[str, str, str], list[list[tuple[float, float]]]] = {}
     with tempfile.TemporaryDirectory() as name:
-        for seed in args.seeds:
+        for seed in seeds:
             for lens, (project, camera) in cases(seed).items():
                 for kind in SCENES:
                     scene = marked(kind, project, camera, seed)
@@ -235,15 +229,10 @@ def main() -> None:
                         done = [adjust(scene, camera, way, Path(name)) for way in WAYS]
                         figures = [(each.reprojection, structure(each.points, scene.points)) for each in done]
                         found.setdefault((lens, kind, program), []).append(figures)
-            print(f"seed {seed} done", flush=True)
     rows = []
     for key, values in found.items():
         reprojection, error = np.moveaxis(np.median(np.array(values), 0), -1, 0)
         rows.append([*key, *(f"{value:.3f}" for value in reprojection), *(f"{value:.3g}" for value in error)])
     heads = ["true lens", "scene", "program", *(f"{way}: reprojection, px" for way in WAYS),
              *(f"{way}: structure, ‰" for way in WAYS)]  # fmt: skip
-    tell("other-programs.md", "bundle adjustment", table(heads, rows), write=args.write)
-
-
-if __name__ == "__main__":
-    main()
+    return table(heads, rows)

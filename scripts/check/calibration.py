@@ -1,7 +1,4 @@
-"""Whether calibration ends where it should, on real views; writes a table of docs/measured/solver.md.
-
-    KCAL_DATA=folder python -m scripts.check.calibration            both checks, 20 starts
-    KCAL_DATA=folder python -m scripts.check.calibration --starts 5 --sets left
+"""Whether calibration ends where it should, on real views.
 
 Richer models must not end above poorer ones (5 to 24 coefficients), and neither the start nor the units of the
 parameters may matter. Corners count alike (`weighted=False`), so that the RMS is what is minimized.
@@ -9,18 +6,15 @@ parameters may matter. Corners count alike (`weighted=False`), so that the RMS i
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import os
-import sys
 import time
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Board, KcalError, Observations, View, detect
+from kcal import KcalError, Observations
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
@@ -28,8 +22,10 @@ from kcal.calibrate.problem.views import free_parameters
 from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import SolverStatus, State, minimize
-from scripts.shared.page import write_section
-from scripts.shared.timing import show
+from scripts.shared import wide_lens
+from scripts.shared.page import table
+from scripts.shared.real_captures import stereo_images
+from scripts.shared.sections import section
 
 LADDER = {5: "opencv5", 8: "opencv8", 12: "opencv12", 14: "opencv14", 16: "ext16", 18: "ext18", 20: "ext20"} | {
     22: "ext22", 24: "ext24"
@@ -37,49 +33,40 @@ LADDER = {5: "opencv5", 8: "opencv8", 12: "opencv12", 14: "opencv14", 16: "ext16
 # Coefficients and weak prior.
 STARTED = ((5, None), (8, None), (14, None), (14, 0.3), (20, 0.3))
 UNITS = 1e6
+SETS = ("left", "right", "wide")
 # Relative, of the RMS: what counts as the same optimum, and as not rising.
 SAME_RMS, SAME_PIXELS = 1e-6, 1e-3
 
 
-def real_sets(folder: Path, names: list[str]) -> dict[str, Observations]:
+def real_sets(names: tuple[str, ...]) -> Iterator[tuple[str, Observations]]:
     """The real views by name: both cameras of OpenCV's sample, and a very wide lens."""
-    found: dict[str, Observations] = {}
-    for side in ("left", "right"):
-        if side in names:
-            images = sorted((folder / "opencv_stereo").glob(f"{side}*.jpg"))
-            found[side] = detect(images, Board(columns=9, rows=6, square=0.025))
-    if "wide" in names:
-        data = np.load(folder / "wide_lens_corners.npz")
-        views = []
-        for number, (corners, weight) in enumerate(zip(data["corners"], data["weight"], strict=True)):
-            pixels = [(float(u), float(v)) if w > 0 else None for (u, v), w in zip(corners, weight, strict=True)]
-            views.append(View(name=str(number), pixels=tuple(pixels)))
-        board = Board(columns=10, rows=10, square=0.077)
-        found["wide"] = Observations(board=board, image_size=(6016, 4016), views=tuple(views))
-    return found
+    for name in names:
+        seen = wide_lens.load()[0] if name == "wide" else stereo_images(name)
+        yield name, seen
 
 
 def options(coefficients: int, focal: float | None = None, weak: float | None = None) -> CalibrationOptions:
     return CalibrationOptions(model=LADDER[coefficients], weighted=False, focal=focal, weak_prior=weak)
 
 
-def ladder(sets: dict[str, Observations]) -> list[str]:
-    """The table of RMS over the models, rises marked."""
-    lines = show([
-        f"| views | {' | '.join(map(str, LADDER))} | rises |",
-        f"|---|{'---|' * len(LADDER)}---|",
-    ])  # fmt: skip
-    for name, seen in sets.items():
-        cells, rises, before = [], [], np.inf
-        for coefficients in LADDER:
-            result = calibrate_camera(seen, options(coefficients))
-            mark = {SolverStatus.AT_BOUND: "ᵇ", SolverStatus.FLAT: "ᶠ"}.get(result.status, "")
-            cells.append(f"{result.rms:.6f}{mark}")
-            if result.rms > before * (1 + SAME_RMS):
-                rises.append(f"{coefficients}: {result.rms / before - 1:+.1e}")
-            before = min(before, result.rms)
-        lines += show([f"| {name} | {' | '.join(cells)} | {', '.join(rises) or 'none'} |"])
-    return lines
+@section("solver.md", "richer models", sets=("left",), most=8)
+def ladder(sets: tuple[str, ...] = SETS, most: int = 24) -> Iterator[str]:
+    """RMS over the models, rises marked."""
+    models = [count for count in LADDER if count <= most]
+
+    def rows() -> Iterator[list[str]]:
+        for name, seen in real_sets(sets):
+            cells, rises, before = [], [], np.inf
+            for coefficients in models:
+                result = calibrate_camera(seen, options(coefficients))
+                mark = {SolverStatus.AT_BOUND: "ᵇ", SolverStatus.FLAT: "ᶠ"}.get(result.status, "")
+                cells.append(f"{result.rms:.6f}{mark}")
+                if result.rms > before * (1 + SAME_RMS):
+                    rises.append(f"{coefficients}: {result.rms / before - 1:+.1e}")
+                before = min(before, result.rms)
+            yield [name, *cells, ", ".join(rises) or "none"]
+
+    return table(["views", *models, "rises"], rows())
 
 
 class Rescaled(BoardProblem):
@@ -144,13 +131,15 @@ def _alone(
     return End(float(torch.sqrt(4 * solved.cost / problem.residual_count)), residuals, SolverStatus(int(solved.status)))
 
 
-def starts(sets: dict[str, Observations], count: int) -> list[str]:
-    """The table of how far ends lie apart."""
-    lines = show([
-        "| views | coefficients | starts | at the optimum | worst RMS | worst projection px | CPU s each |",
-        "|---|---|---|---|---|---|---|",
-    ])  # fmt: skip
-    for name, seen in sets.items():
+@section("solver.md", "starts", sets=("left",), count=1)
+def starts(sets: tuple[str, ...] = SETS, count: int = 20) -> Iterator[str]:
+    """How far ends lie apart."""
+    heads = ["views", "coefficients", "starts", "at the optimum", "worst RMS", "worst projection px", "CPU s each"]
+    return table(heads, _starts(sets, count))
+
+
+def _starts(sets: tuple[str, ...], count: int) -> Iterator[list[str]]:
+    for name, seen in real_sets(sets):
         for coefficients, weak in STARTED:
             draw = np.random.default_rng(coefficients)
             model = LensModel.named(LADDER[coefficients])
@@ -182,30 +171,6 @@ def starts(sets: dict[str, Observations], count: int) -> list[str]:
                 good = sum(abs(r) <= SAME_RMS and p <= SAME_PIXELS for r, p in gaps)
                 worst = [f"{max(g[k] for g in gaps):{form}}" if gaps else "-" for k, form in ((0, "+.1e"), (1, ".1e"))]
                 prior = ", weak prior" if weak else ""
-                lines += show([
-                    f"| {name} | {coefficients}{prior} | {label} | {good} of {len(ends)} | {worst[0]} | {worst[1]} | "
-                    f"{took[label]:.2f} |"
-                ])  # fmt: skip
-    return lines
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sets", nargs="*", default=["left", "right", "wide"], choices=["left", "right", "wide"])
-    parser.add_argument("--starts", type=int, default=20)
-    parser.add_argument("--only", choices=["ladder", "starts"], help="one of the two checks")
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    folder = os.environ.get("KCAL_DATA")
-    if not folder:
-        sys.exit("KCAL_DATA is not set: it names the folder with the real images and corners")
-    sets = real_sets(Path(folder), arguments.sets)
-    if arguments.only != "starts":
-        text = ladder(sets)
-        write_section("solver.md", "richer models", text, write=arguments.write)
-    if arguments.only != "ladder":
-        starts(sets, arguments.starts)
-
-
-if __name__ == "__main__":
-    main()
+                yield [
+                    name, f"{coefficients}{prior}", label, f"{good} of {len(ends)}", *worst, f"{took[label]:.2f}"
+                ]  # fmt: skip

@@ -1,8 +1,5 @@
 """Guided photography of a board against views at random: how many views give the same camera.
 
-    python -m scripts.check.capture --out cells.jsonl --seeds 8      # cells in the file are kept
-    python -m scripts.check.capture --out cells.jsonl --write        # docs/measured/ordinary.md
-
 Each seed has a lens with five coefficients of its own, 1280 x 720, and a board of 9 x 6 corners 25 mm apart. Frames are
 rendered, with noise and a little blur, and corners are detected in them. *Random*: 20 views drawn by
 `kcal.sim.captures.sample_board_poses`: over the whole image, near and far, tilted and rolled. *Guided*: the first four
@@ -10,16 +7,16 @@ views and each next one as `kcal capture` asks for them, held by a person: off b
 along, by 8 degrees of tilt and 10 degrees of roll. A view that is not seen whole is held again.
 
 Guided capture goes on until its σ is that of the 20 random views (points at infinity, RMS over the image; both as kcal
-predicts it), or to 20 views. True errors are those of points at infinity after the best-fit rotation.
+predicts it), or to 20 views. True errors are those of points at infinity after the best-fit rotation. Seeds below 100
+are for tuning.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +32,8 @@ from kcal.lens import rotation_from_vector
 from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_board
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 
 BOARD = Board(columns=9, rows=6, square=0.025)
 PRINT = BoardSize(BOARD.columns, BOARD.rows, BOARD.square)
@@ -123,45 +121,27 @@ def seen_whole(truth: Camera, pose: Pose) -> bool:
     return bool((inside.all(-1) & valid).all())
 
 
-def tables(records: list[dict[str, Any]]) -> list[str]:
+def both(seed: int) -> Record:
+    """σ and true error at random and guided."""
+    truth, start = lens(seed), time.process_time()
+    random = at_random(truth, seed)
+    return {"random": random, "guided": guided(truth, random[0], seed), "cpu_s": time.process_time() - start}
+
+
+@section("ordinary.md", "capture", seeds=range(300, 301))
+def guidance(kept: Kept = NOT_KEPT, seeds: range = range(300, 308)) -> Iterator[str]:
     """One row for each seed, and the means."""
+    records = kept.records([(seed,) for seed in seeds], both)
     head = ["seed", "σ of 20 random views, px", "true error, px", "guided views to this σ", "true error then, px"]
     body, views, ratios = [], [], []
-    for record in sorted(records, key=lambda r: r["seed"]):
+    for record in sorted(records, key=lambda r: r["key"]):
         last, (sigma, error) = record["guided"][-1], record["random"]
         reached = last["sigma"] <= sigma
         views.append(last["views"])
         ratios.append(last["error"] / error)
         count = f"{last['views']:.0f}" if reached else f"not in {last['views']:.0f} ({last['sigma']:.3f} px)"
-        body.append([str(record["seed"]), f"{sigma:.4f}", f"{error:.4f}", count, f"{last['error']:.4f}"])
+        body.append([record["key"][0], f"{sigma:.4f}", f"{error:.4f}", count, f"{last['error']:.4f}"])
     ratio = math.exp(sum(map(math.log, ratios)) / len(ratios))
     median = sorted(views)[len(views) // 2]
     body.append(["all", "", "", f"median {median:.0f}", f"{ratio:.2f} of random (geometric mean)"])
     return table(head, body)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="JSON lines; what is in it is kept")
-    parser.add_argument("--first", type=int, default=300, help="first seed; those below 100 are for tuning")
-    parser.add_argument("--seeds", type=int, default=8)
-    parser.add_argument("--write", action="store_true", help="only write the page")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    records = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.exists() else []
-    if not arguments.write:
-        for seed in range(arguments.first, arguments.first + arguments.seeds):
-            if seed not in {record["seed"] for record in records}:
-                truth, start = lens(seed), time.process_time()
-                random = at_random(truth, seed)
-                record = {"seed": seed, "random": random, "guided": guided(truth, random[0], seed)}
-                records.append({**record, "cpu_s": time.process_time() - start})
-                with arguments.out.open("a") as file:
-                    file.write(json.dumps(records[-1]) + "\n")
-                print(json.dumps(records[-1]), flush=True)
-    lines = tables(records)
-    tell("ordinary.md", "capture", lines, write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,14 +1,5 @@
 """Captures by hand, with a stabilizer, of boards that bend, and pairs that are not simultaneous: do error bars hold?
 
-    python -m scripts.check.captures_that_move --out FILE --seeds 0-99                    # 8 views, by hand, on a stand
-    python -m scripts.check.captures_that_move --out FILE --seeds 0-199 --views 3 4 5 6   # few views
-    python -m scripts.check.captures_that_move --out FILE --seeds 0-99 --fit still        # without the terms for motion
-    python -m scripts.check.captures_that_move --out FILE --seeds 0-39 --views 16 --kinds all      # all that move
-    python -m scripts.check.captures_that_move --out FILE --seeds 0-39 --rigs --kinds all          # rigs of the same
-    python -m scripts.check.captures_that_move --out FILE [OTHER ...] --write             # the tables in docs/measured
-
-Captures that FILE has are not made again, so that a run can be interrupted, and split over several files.
-
 Truth: three traced lenses in turn, decentered, whose entrance pupils move; printed boards (7 x 6 corners, 5 cm), noise
 of 0.08 px. By hand (`scripts.shared.moving_captures`): the camera or the board is held, in turn; a rolling shutter with
 a readout of 10 to 30 ms; rates of 0.1 to 1 rad/s and 0.05 to 0.3 m/s (standard deviation along each axis, drawn for
@@ -28,12 +19,10 @@ in the middle of one frame of each, lies in its 95 % interval: the relative yaw 
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import math
 import statistics
 import time
-from pathlib import Path
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -44,12 +33,11 @@ from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, sample_board_poses
 from scripts.shared.moving_captures import Hands, MovingCapture, draw_motion, moving_capture
-from scripts.shared.page import table, write_section
-from scripts.shared.records import Record, finish, read, seeds
+from scripts.shared.page import table
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import against_truth, bends, default_options, simulated, view_of
-from scripts.shared.timing import show
+from scripts.shared.timing import rms, share
 
-PAGE = "ordinary.md"
 SIGMA = 0.08
 TERMS = ("motion", "bending")
 
@@ -180,31 +168,7 @@ def observed(pixels: Tensor, side: MovingCapture, inside: Tensor, kept: list[int
     return Observations(board=RIG_BOARD, image_size=CAMERA.size, views=views)
 
 
-def line(record: Record) -> str:
-    """One line to print."""
-    if "refused" in record:
-        return f"refused: {record['refused'][:90]}"
-    if "chi2" in record:
-        return f"χ²/6 {record['chi2'] / 6:.2f}, {record['mrad']:.3f} mrad, {record['mm']:.3f} mm, yaw {record['yaw']}"
-    return (
-        f"error {record['rms']:.3f} px, stated {record['predicted']:.3f}, {100 * record['everywhere']:.0f} % in the "
-        f"ellipses, {', '.join(record['causes']) or 'nothing named'}, {record['cpu_s']:.1f} s"
-    )
-
-
-def share(records: list[Record], key: str) -> str:
-    """Mean of a share in percent, with its standard error; captures count alike, for the places of one go together."""
-    values = [100.0 * record[key] for record in records if math.isfinite(record[key])]
-    if len(values) < 2:
-        return "–"
-    return f"{statistics.fmean(values):.1f} ± {statistics.stdev(values) / math.sqrt(len(values)):.1f}"
-
-
-def rms(values: list[float]) -> float:
-    return math.sqrt(statistics.fmean(value**2 for value in values))
-
-
-def lines(records: list[Record]) -> list[str]:
+def lines(records: list[Record]) -> Iterator[str]:
     """One row for each number of views, kind and fit."""
     cells: dict[tuple[int, str, str], list[Record]] = {}
     for record in records:
@@ -220,7 +184,7 @@ def lines(records: list[Record]) -> list[str]:
         true, stated = [r["rms"] for r in known], [r["predicted"] for r in known]
         rows.append(
             [
-                views, kind, fit, len(own), refused, share(known, "everywhere"),
+                views, kind, fit, len(own), refused, share(r["everywhere"] for r in known),
                 f"{statistics.median(true):.3f}", f"{rms(true):.3f}", f"{rms(stated):.3f}",
                 *(f"{100 * statistics.fmean(term in r.get('terms', ()) for r in known):.0f} %" for term in TERMS),
             ]
@@ -232,7 +196,7 @@ def lines(records: list[Record]) -> list[str]:
     return table(head, rows)
 
 
-def moving_lines(records: list[Record]) -> list[str]:
+def moving_lines(records: list[Record]) -> Iterator[str]:
     """One row for each kind: what was named, and what error bars contain."""
     rows = []
     for kind in MOVING:
@@ -247,11 +211,11 @@ def moving_lines(records: list[Record]) -> list[str]:
         ]
         moment = f"{100 * statistics.fmean('synchronization' in r['names'] for r in rigs):.0f} %" if rigs else "–"
         yaw = f"{100 * statistics.fmean(r['yaw'] for r in rigs):.0f} %" if rigs else "–"
-        frames = share([r for r in known if "frame" in r], "frame")
+        frames = share(r["frame"] for r in known if "frame" in r)
         rows.append(
             [
                 kind, f"{len(views)} / {len(pairs)}", f"{len(views) - len(known)} / {len(pairs) - len(rigs)}",
-                *named, moment, share(known, "everywhere"), frames, yaw,
+                *named, moment, share(r["everywhere"] for r in known), frames, yaw,
             ]
         )  # fmt: skip
     head = [
@@ -261,7 +225,7 @@ def moving_lines(records: list[Record]) -> list[str]:
     return table(head, rows)
 
 
-def rig_lines(records: list[Record]) -> list[str]:
+def rig_lines(records: list[Record]) -> Iterator[str]:
     """One row for boards by hand and on a stand, with and without motion."""
     rows = []
     for held_by, fit in itertools.product(("hand", "stand"), ("default", "still")):
@@ -279,43 +243,45 @@ def rig_lines(records: list[Record]) -> list[str]:
     return table(head, rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", nargs="+", type=Path, required=True, help="JSON lines; the first is written to")
-    parser.add_argument("--seeds", type=seeds, help="for example 0-99")
-    parser.add_argument("--views", nargs="+", type=int, default=[8])
-    parser.add_argument("--kinds", nargs="+", choices=[*KINDS, "all"], default=["hand", "stand"])
-    parser.add_argument("--rigs", action="store_true", help="rigs from pairs, in place of captures")
-    parser.add_argument("--fit", choices=FITS, default="default", help="still: no motion; stiff: no bending")
-    parser.add_argument("--write", action="store_true", help="write the tables into the page")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    if arguments.seeds is not None:
-        default_options(**FITS[arguments.fit])
-        kinds = list(MOVING) if "all" in arguments.kinds else arguments.kinds
-        if arguments.rigs:
-            keys = [(k, s, arguments.fit) for s, k in itertools.product(arguments.seeds, kinds)]
-            finish(arguments.out[0], keys, rig, line)
-        else:
-            kinds = [kind for kind in kinds if not KINDS[kind].apart]
-            each = itertools.product(arguments.seeds, arguments.views, kinds)
-            finish(arguments.out[0], [(k, n, s, arguments.fit) for s, n, k in each], captured, line)
-    records = read(arguments.out)
-    rigs = [record for record in records if len(record["key"]) == 3]
-    views = [record for record in records if len(record["key"]) == 4]
-    held = [record for record in views if record["key"][0] in ("hand", "stand")]
-    bent = [record for record in views if record["key"][0] in ("bent", "few bent", "bent, hand")]
-    sections = {
-        "handheld": (held, lines),
-        "bent": (bent, lines),
-        "rigs": (rigs, rig_lines),
-        "moving": (records, moving_lines),
-    }
-    for section, (own, told) in sections.items():
-        text = show(told(own)) if own else []
-        if arguments.write and own:
-            write_section(PAGE, section, text)
+def captures_of(
+    kept: Kept, seeds: range, views: tuple[int, ...], kinds: tuple[str, ...], fits: tuple[str, ...] = ("default",)
+) -> list[Record]:
+    keys = [(kind, count, seed, fit) for seed, count, kind, fit in itertools.product(seeds, views, kinds, fits)]
+    return [one for one in kept.records(keys, captured) if len(one["key"]) == 4 and one["key"][0] in kinds]
 
 
-if __name__ == "__main__":
-    main()
+def rigs_of(kept: Kept, seeds: range, kinds: tuple[str, ...], fits: tuple[str, ...]) -> list[Record]:
+    keys = [(kind, seed, fit) for seed, kind, fit in itertools.product(seeds, kinds, fits)]
+    return [one for one in kept.records(keys, rig) if len(one["key"]) == 3 and one["key"][0] in kinds]
+
+
+@section("ordinary.md", "handheld", seeds=range(2))
+def handheld(
+    kept: Kept = NOT_KEPT, seeds: range = range(100), views: tuple[int, ...] = (8,),
+    fits: tuple[str, ...] = ("default",),
+) -> Iterator[str]:  # fmt: skip
+    """`still`: without the terms for motion."""
+    return lines(captures_of(kept, seeds, views, ("hand", "stand"), fits))
+
+
+@section("ordinary.md", "bent", seeds=range(1))
+def bent(
+    kept: Kept = NOT_KEPT, seeds: range = range(100), views: tuple[int, ...] = (8,),
+    fits: tuple[str, ...] = ("default",),
+) -> Iterator[str]:  # fmt: skip
+    """`stiff`: without the term for bending."""
+    return lines(captures_of(kept, seeds, views, ("bent", "few bent", "bent, hand"), fits))
+
+
+@section("ordinary.md", "moving", seeds=range(1), kinds=("stand", "0.01 s apart, hand"))
+def moving(kept: Kept = NOT_KEPT, seeds: range = range(40), kinds: tuple[str, ...] = tuple(MOVING)) -> Iterator[str]:
+    """Captures of 16 views, and rigs."""
+    still = tuple(kind for kind in kinds if not KINDS[kind].apart)
+    return moving_lines([*captures_of(kept, seeds, (16,), still), *rigs_of(kept, seeds, kinds, ("default",))])
+
+
+@section("ordinary.md", "rigs", seeds=range(1))
+def rigs(
+    kept: Kept = NOT_KEPT, seeds: range = range(100), fits: tuple[str, ...] = ("default", "still")
+) -> Iterator[str]:
+    return rig_lines(rigs_of(kept, seeds, ("hand", "stand"), fits))

@@ -1,8 +1,5 @@
 """The whole chain, simulated: corners, cameras, a rig from landmarks, and ranges of targets up to 5 km.
 
-    python -m scripts.check.chain --out cells.jsonl --draws 10 --boards printed --pupil 3   # cells in the file are kept
-    python -m scripts.check.chain --out *.jsonl --write                                     # docs/measured/chain.md
-
 Truth: two ray-traced surveillance lenses (`kcal.sim.raytrace`), f 1600 px, 1920 x 1080, each with errors of
 assembly of its own, 10 m apart and nearly parallel. Their entrance pupils move by 0, 1 or 3 mm/rad²: with a focal
 length of 6.163 mm the prescription itself has 3 (`scripts.shared.traced.pupil_of` measures it), and for less its
@@ -26,13 +23,10 @@ Seeds below 100 are for tuning.
 
 from __future__ import annotations
 
-import argparse
+import functools
 import itertools
-import json
-import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import cv2
@@ -42,8 +36,9 @@ import torch
 from kcal import Camera, KcalError, Observations
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.sim.captures import TrueRig
-from scripts.check.chain_page import conclude, failures, tables
+from scripts.check.chain_page import failures, tables
 from scripts.check.chain_rig import How, judge, targets, true_rig
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.timing import show
 from scripts.shared.traced import BOARD, as_camera, capture, printed, pupil_of
 
@@ -100,10 +95,6 @@ CHAINS = {
 }
 
 
-def log(text: str) -> None:
-    print(time.strftime("%H:%M:%S"), text, file=sys.stderr, flush=True)
-
-
 def observed(rig: TrueRig, draw: int, board: str, noise: float) -> tuple[Observations, Observations]:
     """What both cameras saw of the board of this draw."""
     points = BOARD.points if board == "exact" else printed(BOARD.points, draw)
@@ -124,63 +115,35 @@ def calibrated(model: str, rig: TrueRig, seen: tuple[Observations, Observations]
         return f"{type(error).__name__}: {error}"
 
 
-def cell(
-    head: dict[str, Any], chains: list[str], marks: int, exact: int, write: Callable[[dict[str, Any]], None]
-) -> None:
+def cell(draw: int, board: str, pupil: float, noise: float, *, chains: Sequence[str], marks: int, exact: int) -> Record:
     """All chains on one draw of lenses, board and corners; each camera is calibrated once."""
-    rig = true_rig(head["draw"], head["pupil"])
-    seen = observed(rig, head["draw"], head["board"], head["noise"])
-    points, zeta = targets(rig), [1e3 * pupil_of(lens) for lens in (rig.left, rig.right)]
+    rig = true_rig(draw, pupil)
+    seen = observed(rig, draw, board, noise)
+    points, zeta, found = targets(rig), [1e3 * pupil_of(lens) for lens in (rig.left, rig.right)], []
     for model, group in itertools.groupby(chains, lambda chain: CHAINS[chain][0]):
         start = time.process_time()
         cameras = calibrated(model, rig, seen)
         spent = time.process_time() - start
         for chain in group:
-            start = time.process_time()
-            record = {**head, "chain": chain, "marks": marks, "pupil_measured": zeta, "calibration_s": spent}
+            record = {"draw": draw, "board": board, "pupil": pupil, "noise": noise, "chain": chain}
+            record |= {"pupil_measured": zeta, "calibration_s": spent}
             if isinstance(cameras, str):
                 record |= {"runs": 0, "failed": {cameras: marks}, "lenses_m": [], "sums": {}}
             else:
-                record |= judge(cameras, CHAINS[chain][1], rig, points, 1_000_000 + 1000 * head["draw"], marks, exact)
-            record["rigs_s"] = time.process_time() - start
-            write(record)
-            log(f"{json.dumps(head)} {chain}: {record['runs']} runs, {spent:.0f} s and {record['rigs_s']:.0f} s")
+                record |= judge(cameras, CHAINS[chain][1], rig, points, 1_000_000 + 1000 * draw, marks, exact)
+            found.append(record)
+    return {"chains": found}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", nargs="+", type=Path, required=True, help="JSON lines; the first is written to")
-    parser.add_argument("--draws", type=int, default=10, help="of lenses, boards and corners")
-    parser.add_argument("--first", type=int, default=300, help="seed of the first of them")
-    parser.add_argument("--marks", type=int, default=24, help="draws of landmarks and marks for each")
-    parser.add_argument("--exact", type=int, default=4, help="of these also without noise, for the lenses alone")
-    parser.add_argument("--boards", nargs="+", choices=("exact", "printed"), default=["exact", "printed"])
-    parser.add_argument("--pupil", nargs="+", type=float, default=[0.0, 1.0, 3.0], help="mm/rad²")
-    parser.add_argument("--noise", nargs="+", type=float, default=[0.05, 0.2], help="of corners, px")
-    parser.add_argument("--chains", nargs="+", choices=CHAINS, default=list(CHAINS), metavar="CHAIN")
-    parser.add_argument("--write", action="store_true", help="only write the page, from all files")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    records = [json.loads(line) for path in arguments.out if path.exists() for line in path.read_text().splitlines()]
-    if arguments.write:
-        conclude(records)
-        return
-    keys = ("draw", "board", "pupil", "noise", "chain")
-    done = {tuple(record[key] for key in keys) for record in records}
-    draws = range(arguments.first, arguments.first + arguments.draws)
-
-    def write(record: dict[str, Any]) -> None:
-        records.append(record)
-        with arguments.out[0].open("a") as file:
-            file.write(json.dumps(record) + "\n")
-
-    for values in itertools.product(draws, arguments.boards, arguments.pupil, arguments.noise):
-        left = [chain for chain in CHAINS if chain in arguments.chains and (*values, chain) not in done]
-        if left:
-            with torch.no_grad():
-                cell(dict(zip(keys, values, strict=False)), left, arguments.marks, arguments.exact, write)
-    show([*tables(records), "", *failures(records)])
-
-
-if __name__ == "__main__":
-    main()
+@section("chain.md", "chain", seeds=range(300, 301), boards=("exact",), pupils=(0.0,), chains=("true",), marks=1)
+def whole_chain(
+    kept: Kept = NOT_KEPT, seeds: range = range(300, 310), boards: tuple[str, ...] = ("exact", "printed"),
+    pupils: tuple[float, ...] = (0.0, 1.0, 3.0), noise: tuple[float, ...] = (0.05, 0.2),
+    chains: tuple[str, ...] = tuple(CHAINS), marks: int = 24, exact: int = 4,
+) -> list[str]:  # fmt: skip
+    """So many draws of landmarks and marks for each; of these `exact` also without noise, for the lenses alone."""
+    work = torch.no_grad()(functools.partial(cell, chains=chains, marks=marks, exact=exact))
+    records = kept.records(itertools.product(seeds, boards, pupils, noise), work, lambda _: "done")
+    found = [one for record in records for one in record["chains"]]
+    show(failures(found))
+    return tables(found)

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from scripts.shared.long_range import RANGES
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.timing import share
 
 Records = Sequence[dict[str, Any]]
 
@@ -27,9 +28,7 @@ def inside(records: Records, i: int | None) -> str:
     """Coverage at a range or at all, percent, ± its standard error by draws of the cameras."""
     index = range(len(RANGES)) if i is None else [i]
     shares = [sum(r["sums"]["inside"][k] for k in index) / sum(r["sums"]["count"][k] for k in index) for r in records]
-    if len(shares) == 1:
-        return f"{100 * shares[0]:.1f}"
-    return f"{100 * statistics.fmean(shares):.1f} ± {100 * statistics.stdev(shares) / len(shares) ** 0.5:.1f}"
+    return share(shares) if len(shares) > 1 else f"{100 * shares[0]:.1f}"
 
 
 def tables(records: Records) -> list[str]:
@@ -86,12 +85,7 @@ def failures(records: Records) -> list[str]:
         rows += [[chain, f"{count} of {total}", message[:200]] for message, count in found.items()]
     if not rows:
         return ["No run failed."]
-    return table(["chain", "runs", "message"], rows)
-
-
-def conclude(records: Records) -> None:
-    """Write the table of the page."""
-    write_section("chain.md", "chain", tables(records))
+    return [*table(["chain", "runs", "message"], rows)]
 
 
 def _values(records: Records, key: str, *, sort: bool = True) -> list[Any]:

@@ -1,14 +1,11 @@
 """What compression of videos does to matched disparities: ten plates of 16 by 12 px at several paces and qualities.
 
-    python -m scripts.check.compression --write            docs/measured/pairing.md, section compression
-
 The default of `kcal live --match-sigma` is what compression adds at CRF 23. A part of the errors stays the same over
 all frames, which the tracker must know (`TrackOptions.lasting_px`): it shows in the mean of each plate's errors.
 """
 
 from __future__ import annotations
 
-import argparse
 import functools
 import itertools
 import math
@@ -26,7 +23,8 @@ from kcal import Camera, Rig
 from kcal.pipeline.video_source import Videos
 from kcal.track import AssociationOptions
 from scripts.shared.object_scene import Floats, exposed, paint_plate, plate, true_box
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.sections import section
 
 SIZE, FOCAL, FRAMES, RATE = (320, 240), 400.0, 100, 25
 # Shares of the full pace, at which plates move by some 0.4 px a frame.
@@ -101,40 +99,32 @@ def errors_of(rig: Rig, films: list[list[Tensor]], boxes: list[list[Floats]], pa
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+@section("pairing.md", "compression", paces=(1.0,), qualities=(23,))
+def compression(paces: tuple[float, ...] = PACES, qualities: tuple[int, ...] = (0, 17, 23, 28)) -> Iterator[str]:
+    yield (
+        f"Ten plates of 16 by 12 px in {FRAMES} frames, H.264 by x264. *Pace*: 1 is some 0.4 px a frame, 0 stands "
+        "still. *Lasts*: the part of each plate's error that is the same in all frames."
+    )
+    yield ""
+    heads = ["pace", "CRF of x264", "RMS of disparity, px", "stated, px", "compression adds, px", "lasts, px"]
+    yield from table(heads, _rows(paces, qualities))
+
+
+def _rows(paces: tuple[float, ...], qualities: tuple[int, ...]) -> Iterator[list[object]]:
     camera = Camera.build(focal=(FOCAL, FOCAL), center=(159.5, 119.5), size=SIZE, model="pinhole")
     rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
-    rows: list[list[object]] = []
-    for pace in PACES:
+    for pace in paces:
         films, boxes = [], []
         for side in (0, 1):
             random = np.random.default_rng(side)
             made = [drawn(rig, side, number / RATE, pace, random) for number in range(FRAMES)]
             films.append([image for image, _ in made])
             boxes.append([np.array(found) + 0.5 for _, found in made])
-        for crf in (0, 17, 23, 28):
+        for crf in qualities:
             error, variance = errors_of(rig, films, boxes, pace, crf)
             rms, stated = (math.sqrt(float(np.nanmean(value))) for value in (error**2, variance))
             more = math.sqrt(max(rms**2 - stated**2, 0.0))
             # The mean over n frames has this variance, besides that of noise: its scatter within the plate over n.
             noise = np.nanvar(error, 0, ddof=1) / (~np.isnan(error)).sum(0)
             lasting = math.sqrt(max(float((np.nanmean(error, 0) ** 2 - noise).mean()), 0.0))
-            rows.append([f"{pace:g}", crf, *(f"{value:.3f}" for value in (rms, stated, more, lasting))])
-            print(*rows[-1], sep=" | ", flush=True)
-    heads = ["pace", "CRF of x264", "RMS of disparity, px", "stated, px", "compression adds, px", "lasts, px"]
-    lines = [
-        f"Ten plates of 16 by 12 px in {FRAMES} frames, H.264 by x264. *Pace*: 1 is some 0.4 px a frame, 0 stands "
-        "still. *Lasts*: the part of each plate's error that is the same in all frames. Made by "
-        "`python -m scripts.check.compression --write`.",
-        "",
-        *table(heads, rows),
-    ]
-    write_section("pairing.md", "compression", lines, write=options.write)
-
-
-if __name__ == "__main__":
-    main()
+            yield [f"{pace:g}", crf, *(f"{value:.3f}" for value in (rms, stated, more, lasting))]

@@ -2,7 +2,7 @@
 
     python -m scripts.check.cpus                           # make test-cpus: the whole test suite, once under each
     python -m scripts.check.cpus --tests tests/calibrate   # some tests
-    python -m scripts.check.cpus --figures --write         # cameras, σ and positions; docs/measured/other-programs.md
+    python -m scripts.measure other-programs cpus          # cameras, σ and positions
 
 Libraries choose their code by the CPU: sums run in another order, products are fused with sums or are not, and results
 differ in the last bits. Environment variables choose in place of the CPU, so one machine stands for others: `MKL_CBWR`
@@ -19,12 +19,13 @@ import subprocess
 import sys
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from kcal.files import make_folder
 from scripts.check.cpus_figures import Row, compare
-from scripts.shared.page import DOCS, table, write_section
+from scripts.shared.page import DOCS, table
+from scripts.shared.sections import section
 from scripts.shared.timing import show
 
 ROOT = DOCS.parents[1]
@@ -116,14 +117,23 @@ def tests_table(found: dict[str, dict[str, str]]) -> list[str]:
     ]
 
 
-def figures(folder: Path) -> list[str]:
-    """Compute all stages under each setting, into folders, and compare each with the first."""
-    places = {setting: folder / str(i) for i, setting in enumerate(SETTINGS)}
+@section("other-programs.md", "cpus", settings=("this CPU", "Intel, AVX2"), cameras=("simulated, opencv5",))
+def figures(
+    folder: Path | None = None, settings: tuple[str, ...] = tuple(SETTINGS), cameras: tuple[str, ...] = ("",)
+) -> Iterator[str]:
+    """Compute all stages under each setting, into folders, and compare each with the first; or only these cameras."""
+    with tempfile.TemporaryDirectory(prefix="kcal-cpus-") as name:
+        yield from _figures(make_folder(folder or Path(name)), settings, cameras)
+
+
+def _figures(folder: Path, settings: tuple[str, ...], cameras: tuple[str, ...]) -> Iterator[str]:
+    places = {setting: folder / str(i) for i, setting in enumerate(settings)}
     first, *others = places
     for setting, place in places.items():
-        words = ["-m", "scripts.check.cpus_figures", str(place), "--common", str(places[first])]
+        given = str(place), str(places[first]), cameras
+        code = f"from scripts.check.cpus_figures import compute; compute{given!r}"
         if not (place / "told.json").exists():
-            subprocess.run([sys.executable, *words], env=environment(setting), cwd=ROOT, check=True)
+            subprocess.run([sys.executable, "-c", code], env=environment(setting), cwd=ROOT, check=True)
     kinds: dict[str, dict[str, Row]] = {}
     for stage, found in compare(places[first], {name: places[name] for name in others}).items():
         name, _, model = stage.rpartition(", ")
@@ -144,31 +154,19 @@ def main() -> None:
     parser.add_argument("--tests", nargs="+", default=["kcal", "tests"], metavar="PATH")
     parser.add_argument("--settings", nargs="+", default=list(SETTINGS), choices=list(SETTINGS), metavar="NAME")
     parser.add_argument("--processes", type=int, default=2, help="0: pytest without workers")
-    parser.add_argument(
-        "--figures", action="store_true", help="cameras, σ and positions; docs/measured/other-programs.md"
-    )
-    parser.add_argument("--folder", type=Path, help="keep outcomes and figures here; what is there is not run again")
-    parser.add_argument("--write", action="store_true", help="figures into docs/measured/other-programs.md")
+    parser.add_argument("--folder", type=Path, help="keep outcomes here; what is there is not run again")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="kcal-cpus-") as name:
-        folder = make_folder(arguments.folder or Path(name))
-        if arguments.figures:
-            lines, different = figures(folder), {}
-        else:
-            kept = folder / "tests.json"
-            found: dict[str, dict[str, str]] = json.loads(kept.read_text()) if kept.exists() else {}
-            for setting in arguments.settings:
-                new = run_tests(setting, arguments.tests, arguments.processes)
-                counts = {word: list(new.values()).count(word) for word in sorted(set(new.values()))}
-                print(f"{setting}: " + ", ".join(f"{count} {word}" for word, count in counts.items()), flush=True)
-                found[setting] = found.get(setting, {}) | new
-                kept.write_text(json.dumps(found), encoding="utf-8")
-            lines, different = tests_table(found), differing(found)
-    show(lines)
-    if arguments.write and arguments.figures:
-        write_section("other-programs.md", "cpus", lines)
-    if different:
-        sys.exit(1)
+        kept = make_folder(arguments.folder or Path(name)) / "tests.json"
+        found: dict[str, dict[str, str]] = json.loads(kept.read_text()) if kept.exists() else {}
+        for setting in arguments.settings:
+            new = run_tests(setting, arguments.tests, arguments.processes)
+            counts = {word: list(new.values()).count(word) for word in sorted(set(new.values()))}
+            print(f"{setting}: " + ", ".join(f"{count} {word}" for word, count in counts.items()), flush=True)
+            found[setting] = found.get(setting, {}) | new
+            kept.write_text(json.dumps(found), encoding="utf-8")
+    show(tests_table(found))
+    sys.exit(bool(differing(found)))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,4 @@
-"""What `scripts/check/cpus.py --figures` computes under each setting, and how far two settings' results differ.
-
-    python -m scripts.check.cpus_figures FOLDER     # one process, under the setting of its environment
+"""What the section "cpus" of docs/measured/other-programs.md computes under each setting, and how far results differ.
 
 Stages: corners of OpenCV's stereo images; cameras of these corners, of other captures and of a simulated one; a rig
 from landmarks with ranges, and a rig from the pairs of boards. Each stage begins with the same input under all settings
@@ -9,7 +7,6 @@ from landmarks with ranges, and a rig from the pairs of boards. Each stage begin
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import os
@@ -20,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcal import Board, DegenerateError, InputError, Localizer, Observations, detect, load_camera
+from kcal import DegenerateError, InputError, Localizer, Observations, load_camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, calibrate_rig, solve_rig
@@ -30,6 +27,7 @@ from kcal.lens.uncertainty import projection_sigma
 from kcal.rig import RigCovariance, pair_by_name
 from kcal.solve import SolverStatus
 from scripts.check import rig as site
+from scripts.shared.real_captures import stereo_images
 from scripts.shared.views import observed, simulate
 
 MODELS = (None, "opencv5", "opencv14")
@@ -53,8 +51,7 @@ def captures(folder: Path) -> dict[str, Observations]:
 
 def find_corners(folder: Path) -> None:
     for side in PAIRS:
-        files = sorted((Path(os.environ["KCAL_DATA"]) / "opencv_stereo").glob(f"{side}*.jpg"))
-        detect(files, Board(columns=9, rows=6, square=0.025)).save(folder / f"{side}.obs.json")
+        stereo_images(side).save(folder / f"{side}.obs.json")
 
 
 def fit_cameras(folder: Path, common: Path, only: list[str]) -> dict[str, Any]:
@@ -192,21 +189,11 @@ def compare(first: Path, others: dict[str, Path]) -> dict[str, Row]:
     return rows
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--common", type=Path, help="whose corners and cameras later stages begin with; itself if none")
-    parser.add_argument("--only", nargs="*", default=[], metavar="CAMERA", help="these cameras only, and no rigs")
-    arguments = parser.parse_args()
-    folder, common = make_folder(arguments.folder), arguments.common or arguments.folder
+def compute(place: str, first: str, cameras: tuple[str, ...]) -> None:
+    """All stages into a folder, in a process under a setting; only these cameras, and no rigs, if any is named."""
+    folder, common = make_folder(Path(place)), Path(first)
+    only = [name for name in cameras if name]
     warnings.simplefilter("ignore")
-    if not arguments.only or common == folder:
-        find_corners(folder)
-    told = {"cameras": fit_cameras(folder, common, arguments.only)}
-    if not arguments.only:
-        told["positions"] = locate(common)
+    find_corners(folder)
+    told = {"cameras": fit_cameras(folder, common, only), "positions": {} if only else locate(common)}
     (folder / "told.json").write_text(json.dumps(told), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

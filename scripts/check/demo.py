@@ -1,32 +1,26 @@
 """How often the intervals of `kcal demo` contain the truth: the whole command, many seeds.
 
-    python -m scripts.check.demo --out seeds.jsonl --seeds 40        # seeds that the file holds are kept
-    python -m scripts.check.demo --out seeds.jsonl --write           # the page, from what is there
-
 Every seed has its own poses, noise, survey and marks; lenses and board are those of the site. The intervals are those
-that the command prints: 95 %.
+that the command prints: 95 %. Seeds below 100 were looked at.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
-import json
 import statistics
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from kcal import Localizer, load_rig, locate_points
 from kcal.cli.demo_run import simulated_site
 from kcal.locate import Marks
 from kcal.locate.positions import position_errors
 from kcal.sim.scene import DemoScene
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.sections import NOT_KEPT, Kept, section
 
 
 def outcome(seed: int) -> dict[str, Any]:
@@ -47,11 +41,13 @@ def outcome(seed: int) -> dict[str, Any]:
         else:
             across, along, inside = miss
             found.append({"name": name, "range": true, "located": True, "across": across, "along": along, "in": inside})
-    return {"seed": seed, "targets": found, "seconds": time.process_time() - start}
+    return {"targets": found, "seconds": time.process_time() - start}
 
 
-def tables(records: list[dict[str, Any]]) -> list[str]:
+@section("chain.md", "demo", seeds=range(100, 102))
+def demo(kept: Kept = NOT_KEPT, seeds: range = range(100, 140)) -> list[str]:
     """Coverage and errors of each target over the seeds."""
+    records = kept.records([(seed,) for seed in seeds], outcome, lambda _: "done")
     rows = []
     names = [target["name"] for target in records[0]["targets"]]
     every: list[bool] = []
@@ -77,26 +73,3 @@ def tables(records: list[dict[str, Any]]) -> list[str]:
         f"{len(records)} seeds: the 95 % intervals contain the true range in {100 * share:.1f} ± {100 * half:.1f} % of "
         f"{len(every)} cases (± from the scatter of seeds).",
     ]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="JSON lines")
-    parser.add_argument("--seeds", type=int, default=40)
-    parser.add_argument("--first", type=int, default=100, help="seeds below were looked at")
-    parser.add_argument("--write", action="store_true", help="only write the page")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    records = [json.loads(line) for line in arguments.out.read_text().splitlines()] if arguments.out.exists() else []
-    done = {record["seed"] for record in records}
-    for seed in range(arguments.first, arguments.first + arguments.seeds) if not arguments.write else ():
-        if seed not in done:
-            records.append(outcome(seed))
-            with arguments.out.open("a") as file:
-                file.write(json.dumps(records[-1]) + "\n")
-    lines = tables(records)
-    tell("chain.md", "demo", lines, write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()

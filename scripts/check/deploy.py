@@ -1,8 +1,5 @@
 """The whole localizer compiled, exported and in onnxruntime, with lenses of every kind, against eager results.
 
-    python -m scripts.check.deploy --write             all kinds, some minutes each; docs/measured/other-programs.md
-    python -m scripts.check.deploy --lenses opencv5    one kind
-
 Among the pixels are one that is not finite and one outside the image; the number of pairs differs from the traced one.
 It ends with an error if a field of the result differs by more than 1e-9 of one plus its size: 1e-9 px, 1e-5 m at 5 km.
 `trace` is one graph by `torch.compile` that runs as it is; `inductor` also translates it to C++.
@@ -10,10 +7,9 @@ It ends with an error if a field of the result differs by more than 1e-9 of one 
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import onnxruntime
@@ -26,8 +22,8 @@ from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import Localization, Localizer
 from kcal.rig import RigCovariance
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import row, show
+from scripts.shared.page import table
+from scripts.shared.sections import section
 
 LENSES = ("pinhole", "opencv5", "opencv14", "ext24", "fisheye4", "hybrid")
 WAYS = ("trace", "inductor", "export", "onnx")
@@ -105,23 +101,13 @@ def checked(lens: str, ways: Sequence[str]) -> list[tuple[float, float]]:
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lenses", nargs="+", choices=LENSES, default=LENSES)
-    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+@section("other-programs.md", "deploy", lenses=("pinhole",), ways=("trace",))
+def deploy(lenses: tuple[str, ...] = LENSES, ways: tuple[str, ...] = WAYS) -> Iterator[str]:
     rows, worst = [], 0.0
-    for lens in options.lenses:
-        found = checked(lens, options.ways)
+    for lens in lenses:
+        found = checked(lens, ways)
         worst = max(worst, *(apart for apart, _ in found))
         rows.append([lens, *(f"{apart:.0e} ({seconds:.0f} s)" for apart, seconds in found)])
-        show([row(*rows[-1])])
-    write_section("other-programs.md", "deploy", table(["lens", *options.ways], rows), write=options.write)
+    yield from table(["lens", *ways], rows)
     if not worst < ALLOWED:
-        raise SystemExit(f"largest difference {worst:.1e}: more than {ALLOWED:.0e}")
-
-
-if __name__ == "__main__":
-    main()
+        raise RuntimeError(f"largest difference {worst:.1e}: more than {ALLOWED:.0e}")

@@ -21,7 +21,7 @@ from PIL import Image
 from kcal.lens import import_cameras
 from scripts.check.exchange import opencv_formula, random_points
 from scripts.shared.page import table
-from scripts.shared.sections import run, section
+from scripts.shared.sections import section
 
 SIZE = (1280, 720)
 K, D = np.array([[900.5, 0, 640.3], [0, 901.3, 359.2], [0, 0, 1]]), [-0.055, 0.066, 7e-4, -9e-4, -0.021]
@@ -141,10 +141,6 @@ def device_rows(folder: Path) -> Iterator[list[str]]:
 
 
 @section("other-programs.md", "devices")
-def devices() -> list[str]:
+def devices() -> Iterator[str]:
     with tempfile.TemporaryDirectory() as name:
         return table(["program", "direction", "lens", "pose", "largest error, px"], [*device_rows(Path(name))])
-
-
-if __name__ == "__main__":
-    run()

@@ -1,7 +1,5 @@
 """Whether cameras survive the way to other programs and back: 10,000 points through each peer's own reader.
 
-    python -m scripts.check.exchange [--mrcal /usr/bin/python3] [--ros /usr/bin/python3] [--colmap PYTHON] [--write]
-
 The options name interpreters that have mrcal, ROS's camera_calibration_parsers and image_geometry, or pycolmap; without
 one its rows stay as they are on the page. OpenCV and SciPy are read in this process. Where no reader of a program can
 be installed here, its published formula projects what PyYAML or json reads.
@@ -9,12 +7,11 @@ be installed here, its published formula projects what PyYAML or json reads.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -23,13 +20,13 @@ import torch
 import yaml
 from scipy.io import loadmat
 
-from kcal import Camera, Rig
-from kcal.lens import LensModel, camera_difference, export_cameras, import_cameras, rotation_from_vector
+from kcal import Camera
+from kcal.lens import LensModel, camera_difference, export_cameras, import_cameras
 from kcal.lens.model import HybridForm, radius_over_angle
 from kcal.lens.zernike import ZernikeModes
 from scripts.check.foreign_lenses import by_formula
-from scripts.shared.page import rows_of_others, table, tell
-from scripts.shared.timing import show
+from scripts.shared.page import merged, table
+from scripts.shared.sections import section
 
 POINTS = 10_000
 LENSES = {
@@ -216,55 +213,6 @@ def fitted_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> l
     return rows
 
 
-def rig_rows(folder: Path, ros: str | None, mrcal: str | None) -> list[list[str]]:
-    """Relative poses after the way to a file and back, and as ROS's and mrcal's own libraries see them."""
-    rotation = rotation_from_vector(torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64))
-    translation = torch.tensor([-1.0, 0.02, 0.01], dtype=torch.float64)
-    rows = []
-    files = {"opencv": "pair.yaml", "ros": "pair.yaml", "kalibr": "chain.yaml", "mrcal": "pair.cameramodel",
-             "matlab": "pair.mat"}  # fmt: skip
-    for format_name, file in files.items():
-        rig = Rig.pair(sample_camera("opencv4"), sample_camera("pinhole"), rotation, translation)
-        done = export_cameras(rig, folder / file, format=format_name)
-        back = import_cameras(*done.paths).rig()
-        turn = float((back.right_from_left_rotation - rotation).abs().max())
-        shift = float((back.right_from_left_translation - translation).abs().max())
-        by_peer = ""
-        points = random_points(rig.right)[0][:1000] + np.array([0.0, 0.0, 5.0])
-        here = points @ rotation.numpy().T + translation.numpy()
-        if format_name == "ros" and ros:
-            np.save(folder / "points.npy", points)
-            ask(ros, "ros-pair", ",".join(map(str, done.paths)), folder / "points.npy", folder / "pixels.npy")
-            content = [yaml.safe_load(path.read_text()) for path in done.paths]
-            expected = []
-            for part, cloud in zip(content, (points, here), strict=True):
-                turned = cloud @ np.reshape(part["rectification_matrix"]["data"], (3, 3)).T
-                seen = turned @ np.reshape(part["projection_matrix"]["data"], (3, 4))[:, :3].T
-                expected.append(seen[:, :2] / seen[:, 2:])
-            by_peer = f"{np.abs(np.load(folder / 'pixels.npy') - np.concatenate(expected, 1)).max():.1e} px"
-        rows.append([format_name, f"{turn:.1e}", f"{shift:.1e}", by_peer])
-    return rows
-
-
-def back_rows(folder: Path, mrcal: str | None, colmap: str | None) -> list[list[str]]:
-    """Files that the peers themselves write, read by kcal."""
-    rows = []
-    jobs = [("mrcal", mrcal, "a.cameramodel", "b.cameramodel", "10 digits"),
-            ("colmap", colmap, "cameras.txt", "out/cameras.txt", ""),
-            ("colmap", colmap, "cameras.bin", "out/cameras.bin", "")]  # fmt: skip
-    (folder / "out").mkdir(exist_ok=True)
-    for kind, python, source, target, note in jobs:
-        if python is None:
-            continue
-        camera = sample_camera("opencv8")
-        export_cameras(camera, folder / source, format=kind)
-        ask(python, f"{kind}-write", str(folder / source), folder, folder / target)
-        points, pixels = random_points(camera)
-        back = import_cameras(folder / target).cameras[0].project(torch.from_numpy(points))[0].numpy()
-        rows.append([f"{kind} {Path(target).suffix}", f"{np.abs(back - pixels).max():.1e}", note])
-    return rows
-
-
 def difference_rows(folder: Path, mrcal: str) -> list[list[str]]:
     """`camera_difference` beside mrcal's on the same two files."""
     rows = []
@@ -289,45 +237,50 @@ def difference_rows(folder: Path, mrcal: str) -> list[list[str]]:
     return rows
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name in ("mrcal", "ros", "colmap"):
-        parser.add_argument(f"--{name}", metavar="PYTHON")
-    parser.add_argument("--write", action="store_true", help="write the tables into docs/measured/other-programs.md")
-    args = parser.parse_args()
-    readers: dict[str, tuple[str, str, Project]] = {
+Reader = tuple[str, str, Project]
+
+
+def readers_of(mrcal: str, ros: str, colmap: str) -> dict[str, Reader]:
+    """File, name and projection of each program that is here."""
+    formula = "json, cv2.projectPoints"
+    readers: dict[str, Reader] = {
         "opencv": ("camera.yaml", "cv2.FileStorage, cv2.projectPoints", by_opencv),
         "kalibr": ("camchain.yaml", "PyYAML, cv2.projectPoints", by_kalibr),
-        "nerfstudio": ("transforms.json", "json, cv2.projectPoints", by_nerfstudio),
+        "nerfstudio": ("transforms.json", formula, by_nerfstudio),
         "matlab": ("camera.mat", "SciPy, MATLAB's documented formula", by_matlab),
-        "opensfm": ("camera_models.json", "json, cv2.projectPoints", by_opensfm),
-        "basalt": ("basalt.json", "json, cv2.projectPoints", by_basalt),
-        "multical": ("multical.json", "json, cv2.projectPoints", by_multical),
+        "opensfm": ("camera_models.json", formula, by_opensfm),
+        "basalt": ("basalt.json", formula, by_basalt),
+        "multical": ("multical.json", formula, by_multical),
     }
-    if args.ros:
-        name = "camera_calibration_parsers, cv2.projectPoints"
-        readers["ros"] = ("ros.yaml", name, peer(args.ros, "ros"))
-    if args.mrcal:
-        readers["mrcal"] = ("camera.cameramodel", "mrcal.cameramodel, mrcal.project", peer(args.mrcal, "mrcal"))
-    if args.colmap:
-        readers["colmap"] = ("cameras.txt", "pycolmap", peer(args.colmap, "colmap"))
+    if ros:
+        readers["ros"] = ("ros.yaml", "camera_calibration_parsers, cv2.projectPoints", peer(ros, "ros"))
+    if mrcal:
+        readers["mrcal"] = ("camera.cameramodel", "mrcal.cameramodel, mrcal.project", peer(mrcal, "mrcal"))
+    if colmap:
+        readers["colmap"] = ("cameras.txt", "pycolmap", peer(colmap, "colmap"))
+    return readers
+
+
+@section("other-programs.md", "formats")
+def formats(mrcal: str = "", ros: str = "", colmap: str = "") -> Iterator[str]:
+    heads = ["format", "models", "reader and projection", "peer, px", "back in kcal, px"]
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        heads = ["format", "models", "reader and projection", "peer, px", "back in kcal, px"]
-        others = rows_of_others("other-programs.md", "formats", 0, readers)
-        holds = table(heads, [*exact_rows(readers, folder), *others])
-        heads = ["lens", "format", "fitted", "RMS, px", "stated maximum, px", "of 10,000 points; within"]
-        others = rows_of_others("other-programs.md", "refitted", 1, readers)
-        parts = {"formats": holds, "refitted": table(heads, [*fitted_rows(readers, folder), *others])}
-        if args.mrcal:
-            heads = ["kcal, RMS px", "mrcal, RMS px", "equal frames, px", "mrcal's turn, px", "own turns, px"]
-            parts["difference"] = table(heads, difference_rows(folder, args.mrcal))
-        show(table(["relative poses", "rotation", "translation, m", "peer's own library"],
-                   rig_rows(folder, args.ros, args.mrcal)))  # fmt: skip
-        show(table(["written by", "largest error, px", ""], back_rows(folder, args.mrcal, args.colmap)))
-    for section, lines in parts.items():
-        tell("other-programs.md", section, lines, write=args.write)
+        rows = exact_rows(readers_of(mrcal, ros, colmap), Path(name))
+    return merged("other-programs.md", "formats", heads, rows)
 
 
-if __name__ == "__main__":
-    main()
+@section("other-programs.md", "refitted")
+def refitted(mrcal: str = "", ros: str = "", colmap: str = "") -> Iterator[str]:
+    heads = ["lens", "format", "fitted", "RMS, px", "stated maximum, px", "of 10,000 points; within"]
+    with tempfile.TemporaryDirectory() as name:
+        rows = fitted_rows(readers_of(mrcal, ros, colmap), Path(name))
+    return merged("other-programs.md", "refitted", heads, rows, keys=2)
+
+
+@section("other-programs.md", "difference")
+def difference(mrcal: str = "") -> Iterator[str]:
+    if not mrcal:
+        raise SystemExit("--mrcal names an interpreter that has mrcal")
+    heads = ["kcal, RMS px", "mrcal, RMS px", "equal frames, px", "mrcal's turn, px", "own turns, px"]
+    with tempfile.TemporaryDirectory() as name:
+        return table(heads, difference_rows(Path(name), mrcal))

@@ -1,8 +1,5 @@
 """Are faults in rigs and captures found, named and refused, and good ones let through?
 
-    python -m scripts.check.faults rigs [--seeds 20]
-    KCAL_DATA=DATA python -m scripts.check.faults captures [--seeds 4] [--cache FOLDER]
-
 Rigs: landmarks as in `scripts.check.rig`, marked to 0.1 px and surveyed to 2 cm. *Named* means that the message, or
 what was left out, names the wrong one; *plain* that neither a refusal, nor something left out, nor a warning tells.
 *Contained* is the share of the six components of the relative pose within their 95 % intervals, of rigs that were
@@ -13,10 +10,8 @@ group.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -26,9 +21,10 @@ from kcal import Baseline, KcalError, Landmarks, Observations, RigData, calibrat
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens import vector_from_rotation
 from scripts.check.rig import BASELINE, NAMES, STRAIGHT, TRUTH, data, generator, landmarks
-from scripts.shared.real_captures import data_folder, load, names
+from scripts.shared.page import table
+from scripts.shared.real_captures import load, names
+from scripts.shared.sections import section
 from scripts.shared.simulated import simulated
-from scripts.shared.timing import row, show
 
 OFF = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)  # m: of a wrong landmark
 CROP, ZOOM, VIEWS, NOISE = 40.0, 1.05, 20, 0.15
@@ -100,8 +96,12 @@ def contained(found: RigResult) -> list[bool]:
     return (error.abs() <= WITHIN * found.relative_covariance().diagonal().sqrt()).tolist()
 
 
-def rig_rows(seeds: int) -> Iterator[str]:
-    yield row("rigs", "refused", "named", "plain", "left out", "contained")
+@section("rig.md", "faults", seeds=1)
+def of_rigs(seeds: int = 20) -> Iterator[str]:
+    return table(["rigs", "refused", "named", "plain", "left out", "contained"], _rig_rows(seeds))
+
+
+def _rig_rows(seeds: int) -> Iterator[list[object]]:
     for kind, make in RIGS.items():
         refused = named = plain = out = 0
         inside: list[bool] = []
@@ -119,7 +119,7 @@ def rig_rows(seeds: int) -> Iterator[str]:
             plain += not gone and not found.warnings
             inside += contained(found)
         share = f"{sum(inside) / len(inside):.2f}" if inside else "–"
-        yield row(kind, f"{refused}/{seeds}", f"{named}", f"{plain}", f"{out}", share)
+        yield [kind, f"{refused}/{seeds}", named, plain, out, share]
 
 
 def changed(seen: Observations, second: set[int], change: Callable[[Tensor], Tensor]) -> Observations:
@@ -144,7 +144,7 @@ def mixed(one: Observations, other: Observations) -> Observations:
     return one.model_copy(update={"views": (*first, *second)})
 
 
-def captures(seeds: int, cache: Path) -> Iterator[tuple[str, Observations, set[int]]]:
+def captures(seeds: int) -> Iterator[tuple[str, Observations, set[int]]]:
     """Kind, views, and which of them are of the second group; none in good captures."""
     odd, late = set(range(1, VIEWS, 2)), set(range(VIEWS // 2, VIEWS))
     for seed in range(seeds):
@@ -154,12 +154,11 @@ def captures(seeds: int, cache: Path) -> Iterator[tuple[str, Observations, set[i
             yield f"good, {how}", seen, set()
             yield f"cropped, {how}", changed(seen, odd, lambda p: p - torch.tensor([CROP, 0.0]).double()), odd
             yield f"zoomed, {how}", changed(seen, late, lambda p, m=middle: (p - m) * ZOOM + m), late  # type: ignore[misc]
-    folder = data_folder()
     for left, right in (("stereo_left", "stereo_right"), ("st1_l", "st1_r")):
-        both = mixed(*(load(name, folder, cache).seen for name in (left, right)))
+        both = mixed(*(load(name).seen for name in (left, right)))
         yield "two real cameras", both, {i for i, name in enumerate(both.names) if name.startswith("two")}
-    for name in names(folder):
-        yield "good, real", load(name, folder, cache).seen, set()
+    for name in names():
+        yield "good, real", load(name).seen, set()
 
 
 def rightly(text: str, seen: Observations, second: set[int]) -> float:
@@ -170,33 +169,19 @@ def rightly(text: str, seen: Observations, second: set[int]) -> float:
     return max(right, len(seen.views) - right) / len(seen.views)
 
 
-def capture_rows(seeds: int, cache: Path) -> Iterator[str]:
+@section("ordinary.md", "two cameras", seeds=1)
+def of_captures(seeds: int = 4) -> Iterator[str]:
     found: dict[str, list[float | None]] = {}
-    for kind, seen, second in captures(seeds, cache):
+    for kind, seen, second in captures(seeds):
         share: float | None = None
         try:
             calibrate_camera(seen)
         except KcalError as error:
             share = rightly(str(error), seen, second)
         found.setdefault(kind, []).append(share)
-    yield row("captures", "refused", "rightly named")
+    rows = []
     for kind, shares in found.items():
         told = [share for share in shares if share is not None]
         mean = f"{sum(told) / len(told):.2f}" if told and "good" not in kind else "–"
-        yield row(kind, f"{len(told)}/{len(shares)}", mean)
-
-
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("rigs", "captures"))
-    parser.add_argument("--seeds", type=int)
-    parser.add_argument("--cache", type=Path, default=Path("build", "captures"))
-    chosen = parser.parse_args()
-    rows = rig_rows(chosen.seeds or 20) if chosen.what == "rigs" else capture_rows(chosen.seeds or 4, chosen.cache)
-    for line in rows:
-        show([line])
-
-
-if __name__ == "__main__":
-    main()
+        rows.append([kind, f"{len(told)}/{len(shares)}", mean])
+    return table(["captures", "refused", "rightly named"], rows)

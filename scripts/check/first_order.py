@@ -1,7 +1,4 @@
-"""Gradient descent and Adam on a calibration problem, beside Levenberg-Marquardt; a section of docs/measured/solver.md.
-
-    python -m scripts.check.first_order
-    python -m scripts.check.first_order --steps 500
+"""Gradient descent and Adam on a calibration problem, beside Levenberg-Marquardt.
 
 The paper (Section 4.3.1) found that first-order optimizers fail on camera calibration. Here all three get the same
 residuals, the same start (base projection, no distortion) and exact gradients. The first-order methods run twice: on
@@ -12,8 +9,9 @@ runs.
 
 from __future__ import annotations
 
-import argparse
+import itertools
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,8 +28,8 @@ from kcal.calibrate.problem.views import free_parameters
 from kcal.lens.model import LensModel
 from kcal.lens.projection import INTRINSICS
 from kcal.solve.lm import LMOptions, minimize
-from scripts.shared.page import write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table
+from scripts.shared.sections import section
 from scripts.shared.views import MODELS, SIZE, simulate
 
 VIEWS = 15
@@ -128,47 +126,31 @@ def draw(runs: dict[int, dict[str, Run]], path: Path) -> None:
     figure.savefig(path, dpi=90)
 
 
-def rows_of(coefficients: int, runs: dict[str, Run]) -> list[str]:
+def rows_of(coefficients: int, runs: dict[str, Run]) -> Iterator[list[object]]:
     bottom = float(runs["Levenberg-Marquardt"].rms[-1])
-    rows = []
     for name, run in runs.items():
         reached = np.flatnonzero(run.rms <= 1.01 * bottom)
         near = f"{reached[0]} ({1e3 * run.seconds[reached[0]]:.0f} ms)" if len(reached) else "never"
-        rows.append(
-            f"| {coefficients} | {name} | {len(run.rms) - 1} | {run.seconds[-1]:.2f} | {run.rms[-1]:.4f} | "
-            f"{run.rms[-1] / bottom:.2f} | {near} |"
-        )
-    return show(rows)
+        yield [
+            coefficients, name, len(run.rms) - 1, f"{run.seconds[-1]:.2f}", f"{run.rms[-1]:.4f}",
+            f"{run.rms[-1] / bottom:.2f}", near,
+        ]  # fmt: skip
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=1500)
-    parser.add_argument("--coefficients", type=int, nargs="*", default=[5, 14], choices=list(MODELS))
-    parser.add_argument("--picture", type=Path, help="draw RMS over steps and time into this file")
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    lines = [
-        "| coefficients | method | steps | s | RMS px | over the lowest | within 1 % |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    show(lines[-2:])
+@section("solver.md", "first-order methods", coefficients=(5,), steps=2)
+def first_order(
+    coefficients: tuple[int, ...] = (5, 14), steps: int = 1500, picture: Path | None = None
+) -> Iterator[str]:
+    """`picture`: draw RMS over steps and time into this file."""
     runs: dict[int, dict[str, Run]] = {}
-    for coefficients in arguments.coefficients:
-        problem, start = set_up(coefficients)
+    for count in coefficients:
+        problem, start = set_up(count)
         levenberg_marquardt(problem, start)  # what is compiled or cached at the first call counts for nobody
-        of = {"Levenberg-Marquardt": levenberg_marquardt(problem, start)}
-        for method in METHODS:
-            for scaled in (False, True):
-                name = f"{method}, scaled" if scaled else method
-                of[name] = best_descent(problem, start, method, scaled, arguments.steps)
-        runs[coefficients] = of
-        lines += rows_of(coefficients, of)
-    if arguments.picture:
-        draw(runs, arguments.picture)
-    write_section("solver.md", "first-order methods", lines, write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+        runs[count] = {"Levenberg-Marquardt": levenberg_marquardt(problem, start)}
+        for method, scaled in itertools.product(METHODS, (False, True)):
+            name = f"{method}, scaled" if scaled else method
+            runs[count][name] = best_descent(problem, start, method, scaled, steps)
+    if picture:
+        draw(runs, picture)
+    heads = ["coefficients", "method", "steps", "s", "RMS px", "over the lowest", "within 1 %"]
+    return table(heads, (cells for count, of in runs.items() for cells in rows_of(count, of)))

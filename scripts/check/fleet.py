@@ -1,7 +1,5 @@
 """A fleet on Dask while its workers are killed, and its scheduler once: the results of an undisturbed run.
 
-    python -m scripts.check.fleet [--cameras 1000] [--views 6] [--every 100] [--workers 2] [--write]
-
 Photographs of a board are drawn for each camera, which has a focal length, center and distortion of its own. The same
 `kcal batch` is run three times on them: by processes of this machine; by a Dask cluster of this machine, of which a
 worker is killed (SIGKILL) after every so many finished pieces of work; and by one whose scheduler is killed as well,
@@ -13,12 +11,10 @@ command, the scheduler, a worker (Linux).
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import csv
 import itertools
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -31,9 +27,10 @@ from typing import NamedTuple
 
 import psutil
 
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.sections import section
 from scripts.shared.small_photographs import COLUMNS, HEIGHT, ROWS, WIDTH, photographs
-from scripts.shared.timing import show
+from scripts.shared.timing import children_seconds
 
 # In σ: fits of the same corners in two processes can differ in their last digits.
 _SAME = 1e-4
@@ -137,7 +134,7 @@ def batch(
                "-o", str(output), *options]  # fmt: skip
     if on is not None:
         command += ["--scheduler", on.address]
-    before, peaks, kills = _children_seconds(), defaultdict[str, float](float), 0
+    before, peaks, kills = children_seconds(), defaultdict[str, float](float), 0
     next_kill = pieces_kept(output) + every
     with tempfile.TemporaryFile("w+") as said:
         running = subprocess.Popen(command, stdout=said, stderr=said, env=_environment())
@@ -153,7 +150,7 @@ def batch(
                 stop_after = 0
         said.seek(0)
         text = said.read()
-    return Run(running.returncode, text, _children_seconds() - before, dict(peaks), kills)
+    return Run(running.returncode, text, children_seconds() - before, dict(peaks), kills)
 
 
 def pieces_kept(output: Path) -> int:
@@ -175,11 +172,6 @@ def _note_peaks(peaks: dict[str, float], command: int, on: Cluster | None) -> No
                 lines = Path(f"/proc/{pid}/status").read_text().splitlines()
                 peak = int(next(line.split()[1] for line in lines if line.startswith("VmHWM"))) / 1024.0
                 peaks[role] = max(peaks[role], peak)
-
-
-def _children_seconds() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def differing(found: Path, expected: Path) -> int:
@@ -213,23 +205,19 @@ def missing_or_twice(output: Path, names: list[str]) -> int:
     return sum(rows[name] != 1 for name in names) + sum(name not in names for name in rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cameras", type=int, default=1000)
-    parser.add_argument("--views", type=int, default=6)
-    parser.add_argument("--every", type=int, default=100, metavar="N", help="pieces of work from one kill to the next")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--model", default="opencv5", help="lens model")
-    parser.add_argument("--refine", default="saddle", help="how corners are refined")
-    parser.add_argument("--write", action="store_true", help="write the table into docs/measured/precision.md")
-    given = parser.parse_args()
+@section("precision.md", "fleet", cameras=2, views=3, every=3)
+def fleet(
+    cameras: int = 1000, views: int = 6, every: int = 100, workers: int = 2, model: str = "opencv5",
+    refine: str = "saddle",
+) -> Iterator[str]:  # fmt: skip
+    """A worker is killed after every so many pieces of work."""
     rows, failed = [], False
     with tempfile.TemporaryDirectory(prefix="kcal-fleet-") as name:
         folder = Path(name)
-        names = [f"camera-{number:05d}" for number in range(given.cameras)]
+        names = [f"camera-{number:05d}" for number in range(cameras)]
         for number, camera in enumerate(names):
-            photographs(folder / "images" / camera, number, given.views)
-        source, options = folder / "images", ("--model", given.model, "--refine", given.refine)
+            photographs(folder / "images" / camera, number, views)
+        source, options = folder / "images", ("--model", model, "--refine", refine)
 
         def add(title: str, output: Path, runs: list[Run], seconds: float) -> None:
             nonlocal failed
@@ -241,38 +229,34 @@ def main() -> None:
             memory = [f"{peak:.0f}" if peak else "–" for peak in peaks.values()]
             counts = [f"{differ:,} of {len(names):,}", f"{away:.0e}", f"{wrong}", f"{pieces_kept(output):,}"]
             rows.append([title, kills, *counts, f"{seconds:.0f}", *memory])
-            show([" | ".join(rows[-1]), *(run.said.strip().splitlines()[-1] for run in runs)])
 
-        whole = batch(source, folder / "whole", "--workers", str(given.workers), *options)
+        whole = batch(source, folder / "whole", "--workers", str(workers), *options)
         add("processes, undisturbed", folder / "whole", [whole], whole.seconds)
 
-        before = _children_seconds()
-        with cluster(folder, given.workers) as dask:
-            run = batch(source, folder / "killed", *options, on=dask, every=given.every)
-        add("Dask, workers killed", folder / "killed", [run], _children_seconds() - before)
+        before = children_seconds()
+        with cluster(folder, workers) as dask:
+            run = batch(source, folder / "killed", *options, on=dask, every=every)
+        add("Dask, workers killed", folder / "killed", [run], children_seconds() - before)
 
-        before = _children_seconds()
-        half = len(names) * (given.views + 1) // 2
-        with cluster(folder, given.workers) as dask:
-            first = batch(source, folder / "resumed", *options, on=dask, every=given.every, stop_after=half)
+        before = children_seconds()
+        half = len(names) * (views + 1) // 2
+        with cluster(folder, workers) as dask:
+            first = batch(source, folder / "resumed", *options, on=dask, every=every, stop_after=half)
         assert first.code == 1, first
         assert "the same command" in first.said, first
-        with cluster(folder, given.workers) as dask:
-            second = batch(source, folder / "resumed", *options, on=dask, every=given.every)
+        with cluster(folder, workers) as dask:
+            second = batch(source, folder / "resumed", *options, on=dask, every=every)
         add(
             "Dask, also its scheduler, then continued",
             folder / "resumed",
             [first, second],
-            _children_seconds() - before,
+            children_seconds() - before,
         )
-    if given.write:
-        size = f"{given.cameras:,} cameras of {given.views} images of {WIDTH} x {HEIGHT}, {given.model}"
-        sizes = f"--cameras {given.cameras} --views {given.views} --every {given.every}"
-        how = f"`python -m scripts.check.fleet {sizes} --write`: {size}, {given.workers} workers of one thread,"
-        lines = [*table(HEAD, rows), "", f"{how} a kill after every {given.every} pieces of work."]
-        write_section("precision.md", "fleet", lines)
-    sys.exit(failed)
-
-
-if __name__ == "__main__":
-    main()
+    yield from table(HEAD, rows)
+    yield ""
+    yield (
+        f"{cameras:,} cameras of {views} images of {WIDTH} x {HEIGHT}, {model}, {workers} workers of one thread, "
+        f"a kill after every {every} pieces of work."
+    )
+    if failed:
+        raise RuntimeError("a run differs from the undisturbed one")

@@ -13,11 +13,9 @@ and from the neighborhood of points that the lens turns over.
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections import Counter
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -25,9 +23,8 @@ import torch
 from numpy.polynomial import Polynomial
 from torch import Tensor
 
-from kcal import Board, Camera, detect
+from kcal import Camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.corners.images import expand_images
 from kcal.lens import LensModel
 from kcal.lens.inverse import inverse_jacobian, newton_step, prepare_inverse, undistort
 from kcal.lens.model import distort_components
@@ -35,7 +32,8 @@ from kcal.lens.projection import from_pixels
 from kcal.lens.region import DIRECTIONS, Region, direction_limits, in_region, sampled_region, valid_region
 from scripts.check.uncertainty import LENS
 from scripts.shared.page import table
-from scripts.shared.sections import run, section
+from scripts.shared.real_captures import stereo_images
+from scripts.shared.sections import section
 from scripts.shared.timing import show
 from scripts.shared.wide_lens import load
 
@@ -180,7 +178,7 @@ def sampled(lens: Lens) -> Region:
     return sampled_region(lens.coefficients, lens.model, direction_limits(lens.coefficients, lens.model, directions))
 
 
-def constructed(count: int, seed: int, compared: int, minutes: float) -> list[str]:
+def constructed(count: int, seed: int, compared: int, minutes: float) -> Iterator[str]:
     """How many constructed lenses have two rays; of the first ones also without the proof."""
     end = time.monotonic() + 60.0 * minutes
     generator, tally = np.random.default_rng(seed), Counter[tuple[str, str]]()
@@ -233,11 +231,7 @@ def mild(generator: np.random.Generator) -> Camera:
 
 def calibrated() -> list[Camera]:
     """Cameras of the real views, with parametric models."""
-    folder = os.environ["KCAL_DATA"]
-    sources = [load()[0]]
-    for side in ("left", "right"):
-        paths = expand_images([str(Path(folder, "opencv_stereo", f"{side}*.jpg"))])
-        sources.append(detect(paths, Board(columns=9, rows=6, square=0.025)))
+    sources = [load()[0], stereo_images("left"), stereo_images("right")]
     models = ("opencv5", "opencv8", "opencv14", "ext20", "ext24")
     return [
         calibrate_camera(seen, CalibrationOptions(model=model, weak_prior=weak)).camera
@@ -247,7 +241,7 @@ def calibrated() -> list[Camera]:
     ]
 
 
-def ordinary_lenses(count: int, seed: int) -> list[str]:
+def ordinary_lenses(count: int, seed: int) -> Iterator[str]:
     """Valid pixels that ordinary cameras lose by the proof."""
     generator = np.random.default_rng(seed)
     groups: dict[str, tuple[list[Camera], int]] = {
@@ -269,7 +263,7 @@ def ordinary_lenses(count: int, seed: int) -> list[str]:
     return table(["cameras", "number", "that fold inside the image", "valid pixels", "lost"], rows)
 
 
-def build_times(rounds: int) -> list[str]:
+def build_times(rounds: int) -> Iterator[str]:
     """Time of `Camera.build`, and of the proof in it."""
 
     def median(call: Callable[..., object], *arguments: object) -> float:
@@ -295,13 +289,9 @@ def build_times(rounds: int) -> list[str]:
 @section("lens.md", "folds", lenses=3, compared=1, ordinary=0)
 def folds(
     lenses: int = 10_000, compared: int = 1000, minutes: float = math.inf, ordinary: int = 400, seed: int = 0
-) -> list[str]:
-    text = constructed(lenses, seed, compared, minutes)
+) -> Iterator[str]:
+    yield from constructed(lenses, seed, compared, minutes)
     if ordinary:
-        text += ["", *ordinary_lenses(ordinary, seed)]
-    show(build_times(15))
-    return text
-
-
-if __name__ == "__main__":
-    run()
+        yield ""
+        yield from ordinary_lenses(ordinary, seed)
+    show([*build_times(15)])

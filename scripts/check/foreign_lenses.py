@@ -25,7 +25,7 @@ from scipy.io import savemat
 from kcal import Camera
 from kcal.lens import export_cameras, import_cameras
 from scripts.shared.page import table
-from scripts.shared.sections import run, section
+from scripts.shared.sections import section
 
 SIZE, FX, FY, CX, CY = (640, 480), 280.0, 285.0, 330.0, 236.0
 Points = np.ndarray
@@ -324,10 +324,6 @@ def rows(folder: Path) -> Iterator[list[str]]:
 
 
 @section("other-programs.md", "foreign lenses")
-def foreign_lenses() -> list[str]:
+def foreign_lenses() -> Iterator[str]:
     with tempfile.TemporaryDirectory() as name:
         return table(["program", "direction", "lens", "largest error, px", "reader"], rows(Path(name)))
-
-
-if __name__ == "__main__":
-    run()

@@ -13,20 +13,20 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from scripts.shared.page import DOCS, table
-from scripts.shared.sections import run, section
+from scripts.shared.sections import section
+from scripts.shared.timing import children_seconds
 
 ROOT = DOCS.parents[1]
 # Extras of users; the others are for kcal's own tests and pages.
@@ -82,12 +82,11 @@ def seconds(words: list[str], path: str, runs: int) -> float:
     """CPU seconds of a command, the median of its runs."""
     spent = []
     for _ in range(runs):
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        before = children_seconds()
         subprocess.run(
             [sys.executable, *words], env=os.environ | {"PYTHONPATH": path}, capture_output=True, check=True, cwd=ROOT
         )
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+        spent.append(children_seconds() - before)
     return statistics.median(spent)
 
 
@@ -125,7 +124,7 @@ def opencv_packages(
         "opencv-python==4.12.0.88",
     ),
     images: int = 13,
-) -> list[str]:
+) -> Iterator[str]:
     """Corners of OpenCV's sample images with other packages of OpenCV, against those with kcal's own."""
     if "KCAL_DATA" not in os.environ:
         raise SystemExit("KCAL_DATA names no folder of captures")
@@ -155,7 +154,3 @@ def opencv_packages(
                   for a, b in zip(p, q, strict=True))  # fmt: skip
         rows.append([*package.split("=="), sum(map(len, found)), f"{far:.1g}"])
     return table(["package", "version", "corners", "largest difference, px"], rows)
-
-
-if __name__ == "__main__":
-    run()

@@ -1,40 +1,31 @@
-"""Does `kcal check` judge right? Its verdict on calibrations whose truth is known; writes a section of ordinary.md.
-
-    python -m scripts.check.intervals --out FILE --seeds 0-19 --refits 100     # all of it
-    python -m scripts.check.intervals --out FILE --seeds 0-9 --refits 30       # a fifth of the time
-    python -m scripts.check.intervals --out FILE [OTHER ...] --write           # the table in docs/measured
-    python -m scripts.check.intervals --cold 8 [--write]                       # warm refits beside cold ones
-
-Calibrations that FILE has are not made again, so that a run can be interrupted, and split over several files.
+"""Does `kcal check` judge right? Its verdict on calibrations whose truth is known.
 
 Captures are those of `scripts.check.captures_that_move`: three traced lenses in turn, printed boards, noise of
 0.08 px; 5, 8, 12 and 20 views in turn, every other one by hand. Each is calibrated with the default lens, whose
 intervals should be true, and with opencv5, which describes neither lens nor board, so that they should not. A second
-capture of the same lens
-and board, with as many views, is what `--against` gets. Truth: the share of the image in which the true lens lies in
-the stated 95 % ellipses, at infinity after the best-fit rotation. Intervals count as true where it is more than half:
-places of one calibration go together, so that true intervals have all of the image inside or, seldom, little of it.
+capture of the same lens and board, with as many views, is what `--against` gets. Truth: the share of the image in which
+the true lens lies in the stated 95 % ellipses, at infinity after the best-fit rotation. Intervals count as true where
+it is more than half: places of one calibration go together, so that true intervals have all of the image inside or,
+seldom, little of it.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 import statistics
 import time
-from pathlib import Path
+from collections.abc import Iterator
 
 from kcal import CalibrationOptions, KcalError, calibrate_camera
 from kcal.calibrate.camera.trust import against_capture, interval_check, simulated_capture, simulated_refits
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.report.judge_camera import fault_of_views
 from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import table, tell
-from scripts.shared.records import Record, finish, read, seeds
+from scripts.shared.page import table
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import figures, simulated
 
-PAGE, SECTION = "ordinary.md", "intervals"
 SIGMA, VIEWS, MODELS = 0.08, (5, 8, 12, 20), ("hybrid", "opencv5")
 AT = [math.inf]
 HALF = 0.5
@@ -71,19 +62,7 @@ def judged(model: str, seed: int, refits: int) -> Record:
     }
 
 
-def line(record: Record) -> str:
-    """One line to print."""
-    if "refused" in record:
-        return f"refused: {record['refused'][:90]}"
-    return (
-        f"truth {record['truth']:.2f} inside; check {record['share']:.3f} (own ellipses {record['own']:.3f}), factor "
-        f"{record['factor']:.2f}, {'true' if record['true'] else 'FALSE'}; views {record['fault']}; against "
-        f"p {record['probability']:.2g}; "
-        f"{record['cpu_s']:.0f} s"
-    )
-
-
-def lines(records: list[Record]) -> list[str]:
+def lines(records: list[Record]) -> Iterator[str]:
     """One row for each lens model."""
     rows = []
     for model in MODELS:
@@ -115,11 +94,12 @@ def lines(records: list[Record]) -> list[str]:
     return table(heads, rows)
 
 
-def cold_and_warm(count: int) -> list[str]:
+@section("ordinary.md", "warm refits", count=1, seeds=(0,))
+def cold_and_warm(count: int = 8, seeds: tuple[int, ...] = (0, 1, 5, 6)) -> Iterator[str]:
     """How far refits that begin at the found camera end from those that begin with nothing."""
     rows = []
     options = CalibrationOptions()
-    for seed in (0, 1, 5, 6):
+    for seed in seeds:
         views, by_hand = VIEWS[seed // 2 % len(VIEWS)], bool(seed % 2)
         result = calibrate_camera(simulated(seed, views, SIGMA, by_hand).seen, options)
         places = result.camera.grid(25, 17).reshape(-1, 2)
@@ -141,25 +121,6 @@ def cold_and_warm(count: int) -> list[str]:
     return table(heads, rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, nargs="+", help="JSON lines; the first file is continued")
-    parser.add_argument("--seeds", type=seeds, default=range(20))
-    parser.add_argument("--refits", type=int, default=100)
-    parser.add_argument("--models", nargs="+", default=MODELS, choices=MODELS)
-    parser.add_argument("--cold", type=int, default=0, metavar="REFITS", help="only compare warm and cold refits")
-    parser.add_argument("--write", action="store_true", help="write the table in docs/measured, and stop")
-    arguments = parser.parse_args()
-    if arguments.cold:
-        tell(PAGE, "warm refits", cold_and_warm(arguments.cold), write=arguments.write)
-        return
-    if not arguments.out:
-        parser.error("--out is needed")
-    if not arguments.write:
-        keys = itertools.product(arguments.models, arguments.seeds, [arguments.refits])
-        finish(arguments.out[0], keys, judged, line)
-    tell(PAGE, SECTION, lines(read(arguments.out)), write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+@section("ordinary.md", "intervals", seeds=range(1), refits=2)
+def intervals(kept: Kept = NOT_KEPT, seeds: range = range(20), refits: int = 100) -> Iterator[str]:
+    return lines(kept.records(itertools.product(MODELS, seeds, [refits]), judged))

@@ -1,16 +1,15 @@
 """What errs in a real scene at long range: relative yaw by noise, by halves of matches, by lenses, and by causes.
 
-`python -m scripts.check.long_range --write` writes the tables of docs/measured/long-range.md and its picture, from
-KCAL_DATA/longrange. Cameras that are calibrated already are kept in the folder KCAL_TRIALS (here if not set).
+Of KCAL_DATA/longrange. Cameras that are calibrated already are kept in the folder KCAL_TRIALS (here if not set).
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
+import functools
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
@@ -27,12 +26,14 @@ from kcal.lens.pose import side_axes
 from kcal.locate.stereo import sight_lines
 from kcal.rig import read_features
 from kcal.scene.common_errors import line_errors
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.real_captures import data_folder
+from scripts.shared.sections import section
 
-PAGE = "long-range.md"
 PICTURE = Path(__file__).parents[2] / "docs" / "measured" / "long-range.png"
 TRIALS = Path(os.environ.get("KCAL_TRIALS", "."))
 LENGTH, TAPE = 2.1336, 0.01
+HALVES = ["halves", "pitch", "yaw", "roll", "χ² of 5"]
 DEGREE = 180.0 / math.pi
 # Pixels in the middle of the upper half of the image: where far things are, and no match.
 FAR = torch.cartesian_prod(torch.linspace(1500.0, 4500.0, 7), torch.linspace(900.0, 1900.0, 3)).double()
@@ -235,53 +236,67 @@ def picture(rig: Rig, pixels: Tensor, out: Tensor) -> None:
     figure.savefig(PICTURE, dpi=110)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--write", action="store_true", help="write the page's tables and its picture")
-    write = parser.parse_args().write
-    folder = Path(os.environ["KCAL_DATA"]) / "longrange"
+@functools.cache
+def scene() -> tuple[Observations, Features, dict[float, RigResult]]:
+    """Views of the board, matches, and rigs by the noise that is stated of these."""
+    folder = data_folder() / "longrange"
     observations = Observations.load(folder / "board.obs.json")
     features = read_features(folder / "features.csv", 0.3)
     camera = lens(observations, "all views")
-    rows, results = [], {}
-    for sigma in (0.3, 0.2, 0.15):
-        found = results[sigma] = solved(features, camera, sigma)
+    return observations, features, {sigma: solved(features, camera, sigma) for sigma in (0.3, 0.2, 0.15)}
+
+
+def kept_matches() -> tuple[Rig, Tensor, Tensor]:
+    """The rig of the smallest noise, all matches, and which it leaves out."""
+    _, features, results = scene()
+    names = {item.name for item in results[0.15].left_out}
+    return results[0.15].stereo(), features.pixels, torch.tensor([name in names for name in features.names])
+
+
+@section("long-range.md", "noise")
+def noise() -> Iterator[str]:
+    rows, (_, _, results) = [], scene()
+    for sigma, found in results.items():
         turn = turned(found.stereo().right_from_left_rotation, results[0.3].stereo().right_from_left_rotation)
         sigmas = (DEGREE * found.sigma_rotation).tolist()
         cells = [f"{value:+z.4f} ± {own:.4f}°" for value, own in zip(turn, sigmas, strict=True)]
         left_out = ", ".join(item.name for item in found.left_out)
         rows.append([f"{sigma} px", left_out, f"{found.chi2 / found.freedom:.2f}", *cells])
-    heads = ["stated noise", "left out", "χ² / freedom", "pitch", "yaw", "roll"]
-    tell(PAGE, "noise", table(heads, rows), write=write)
-    every = features.pixels
-    rig = results[0.15].stereo()
-    out = torch.tensor([name in {item.name for item in results[0.15].left_out} for name in features.names])
-    heads = ["halves", "pitch", "yaw", "roll", "χ² of 5"]
-    tell(PAGE, "halves-all", table(heads, halves(rig, every)), write=write)
-    tell(PAGE, "halves", table(heads, halves(rig, every[~out])), write=write)
+    return table(["stated noise", "left out", "χ² / freedom", "pitch", "yaw", "roll"], rows)
+
+
+@section("long-range.md", "halves-all")
+def halves_of_all() -> Iterator[str]:
+    rig, every, _ = kept_matches()
+    return table(HALVES, halves(rig, every))
+
+
+@section("long-range.md", "halves")
+def halves_of_kept() -> Iterator[str]:
+    rig, every, out = kept_matches()
+    return table(HALVES, halves(rig, every[~out]))
+
+
+@section("long-range.md", "lenses", lenses=("all views",))
+def lenses(lenses: tuple[str, ...] = ("all views", "first half", "second half", "opencv8")) -> Iterator[str]:
+    rig, every, out = kept_matches()
     base, rows = refitted(rig, every[~out]), []
-    for name, model in (("all views", None), ("first half", None), ("second half", None), ("opencv8", "opencv8")):
-        other = lens(observations, name, model)
-        own = refitted(Rig.pair(other, other, *_pose(rig)), every[~out])
+    for name in lenses:
+        other = lens(scene()[0], name, "opencv8" if name == "opencv8" else None)
+        pose = rig.right_from_left_rotation, rig.right_from_left_translation
+        own = refitted(Rig.pair(other, other, *pose), every[~out])
         turn = turned(own.right_from_left_rotation, base.right_from_left_rotation)
         record = other.calibration.record if other.calibration else None
         rms = "" if record is None else f"{record.rms:.2f}"
-        noise = fitted(own, every[~out]).sigma
-        rows.append([name, rms, f"{noise:.3f}", *(f"{value:+z.4f}°" for value in turn)])
-    tell(PAGE, "lenses", table(["lens from", "RMS of corners, px", "matches off, px", "pitch", "yaw", "roll"], rows),
-         write=write)  # fmt: skip
-    heads = [
-        "cause", "as matches say", "in its σ", "changes yaw by", "one unit, unknown, changes yaw by",
-        "and disparity at infinity by, px",
-    ]  # fmt: skip
-    tell(PAGE, "causes", table(heads, causes(base, every[~out])), write=write)
+        rows.append([name, rms, f"{fitted(own, every[~out]).sigma:.3f}", *(f"{value:+z.4f}°" for value in turn)])
+    return table(["lens from", "RMS of corners, px", "matches off, px", "pitch", "yaw", "roll"], rows)
+
+
+@section("long-range.md", "causes")
+def all_causes(write: bool = False) -> Iterator[str]:
+    rig, every, out = kept_matches()
+    base = refitted(rig, every[~out])
     if write:
         picture(base, every, out)
-
-
-def _pose(rig: Rig) -> tuple[Tensor, Tensor]:
-    return rig.right_from_left_rotation, rig.right_from_left_translation
-
-
-if __name__ == "__main__":
-    main()
+    heads = ["cause", "as matches say", "in its σ", "changes yaw by", "one unit, unknown, changes yaw by"]
+    return table([*heads, "and disparity at infinity by, px"], causes(base, every[~out]))

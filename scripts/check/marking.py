@@ -1,8 +1,5 @@
 """Marks on rendered targets of known position: clicks that snap, matches in the other image, false proposals.
 
-    python -m scripts.check.marking --write            30 targets of each kind; docs/measured/marking.md
-    python -m scripts.check.marking --each 5           quick look
-
 Every target is painted into both images of a rig, with noise of 1.5 gray levels and a blur of 0.5 to 1.1 px; before a
 plain background, and before far hills whose gray levels vary by 2.8. Clicks are up to 3 px away from it in the left
 image.
@@ -10,9 +7,11 @@ image.
 
 from __future__ import annotations
 
-import argparse
 import collections
+import functools
+import itertools
 import math
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -22,9 +21,10 @@ from kcal import InputError, Rig
 from kcal.mark.guide import at_shape, propose
 from kcal.mark.shapes import snap
 from scripts.shared.marking_scene import KINDS, Floats, background, finished, inside_of, paint, seen, site_rig
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.sections import section
+from scripts.shared.timing import rms as rms_of
 
-PAGE = "marking.md"
 CONTRASTS = (20.0, 40.0, 80.0)
 BACKGROUNDS = {"plain": 0.0, "hills": 0.8}
 NOISE = 1.5
@@ -131,7 +131,7 @@ def trap(rig: Rig, hills: list[Floats], kind: str, random: np.random.Generator) 
 
 
 def rms(marks: list[Mark]) -> float:
-    return float(np.sqrt(np.mean(np.square([mark.error for mark in marks])))) if marks else math.nan
+    return rms_of([mark.error for mark in marks]) if marks else math.nan
 
 
 def covered(marks: list[Mark]) -> str:
@@ -173,55 +173,56 @@ def match_rows(trials: list[Trial]) -> list[list[str]]:
     return rows
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--each", type=int, default=30, help="targets of each kind, contrast and background")
-    parser.add_argument("--traps", type=int, default=100, help="of each kind")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", action="store_true", help=f"write docs/measured/{PAGE}")
-    options = parser.parse_args()
-    rig = site_rig(800, 450)
-    random = np.random.default_rng(options.seed)
+@functools.cache
+def drawn(each: int, traps: int, seed: int) -> tuple[list[Trial], dict[str, list[bool | None]]]:
+    """Targets of each kind, contrast and background, and traps of each kind."""
+    rig, random = site_rig(800, 450), np.random.default_rng(seed)
     behind = {
-        name: [background(rig, side, np.random.default_rng(options.seed), amplitude) for side in (0, 1)]
+        name: [background(rig, side, np.random.default_rng(seed), amplitude) for side in (0, 1)]
         for name, amplitude in BACKGROUNDS.items()
     }
-    trials = [
-        trial(rig, name, images, kind, contrast, random)
-        for name, images in behind.items()
-        for kind in KINDS for contrast in CONTRASTS for _ in range(options.each)
-    ]  # fmt: skip
-    traps = {
-        kind: [trap(rig, behind["hills"], kind, random) for _ in range(options.traps)]
-        for kind in ("hidden", "absent", "row", "flat")
-    }
-    snaps, matches = "", ""
+    cases = itertools.product(behind.items(), KINDS, CONTRASTS, range(each))
+    trials = [trial(rig, name, images, kind, contrast, random) for (name, images), kind, contrast, _ in cases]
+    kinds = ("hidden", "absent", "row", "flat")
+    return trials, {kind: [trap(rig, behind["hills"], kind, random) for _ in range(traps)] for kind in kinds}
+
+
+def by_background(
+    heads: list[str], rows: Callable[[list[Trial]], list[list[str]]], trials: list[Trial]
+) -> Iterator[str]:
     for name in BACKGROUNDS:
-        some = [t for t in trials if t.background == name]
-        heads = ["target", "contrast", "RMS px", "stated σ px", "in 95 % ellipse", "beyond 1 px", "shape found"]
-        snaps += "\n".join([f"\nBackground: {name}.\n", *table(heads, snap_rows(some))]) + "\n"
-        heads = ["target", "contrast", "match: RMS px", "in 95 %", "false", "refused"]
-        heads += ["at its shape: RMS px", "in 95 %", "false", "refused"]
-        matches += "\n".join([f"\nBackground: {name}.\n", *table(heads, match_rows(some))]) + "\n"
-    rows = [[kind, len(found), sum(f is not None for f in found), sum(f is True for f in found)]
-            for kind, found in traps.items()]  # fmt: skip
-    false = "\n".join(table(["trap", "tried", "proposals", "false"], rows))
+        yield from [f"Background: {name}.", ""]
+        yield from table(heads, rows([one for one in trials if one.background == name]))
+        yield ""
+
+
+@section("marking.md", "snap", each=1, traps=1)
+def snaps(each: int = 30, traps: int = 100, seed: int = 0) -> Iterator[str]:
+    heads = ["target", "contrast", "RMS px", "stated σ px", "in 95 % ellipse", "beyond 1 px", "shape found"]
+    return by_background(heads, snap_rows, drawn(each, traps, seed)[0])
+
+
+@section("marking.md", "match", each=1, traps=1)
+def matches(each: int = 30, traps: int = 100, seed: int = 0) -> Iterator[str]:
+    heads = ["target", "contrast", "match: RMS px", "in 95 %", "false", "refused"]
+    heads += ["at its shape: RMS px", "in 95 %", "false", "refused"]
+    return by_background(heads, match_rows, drawn(each, traps, seed)[0])
+
+
+@section("marking.md", "false", each=1, traps=1)
+def false_proposals(each: int = 30, traps: int = 100, seed: int = 0) -> Iterator[str]:
+    trials, caught = drawn(each, traps, seed)
+    rows = [
+        (kind, len(found), sum(f is not None for f in found), sum(f is True for f in found))
+        for kind, found in caught.items()
+    ]
+    yield from table(["trap", "tried", "proposals", "false"], rows)
     given = [t.proposal for t in trials if t.proposal is not None]
-    wrong = len(given) - len(near(list(given))) + sum(row[3] for row in rows if isinstance(row[3], int))
-    total = len(given) + sum(row[2] for row in rows if isinstance(row[2], int))
-    asked = len(trials) + sum(len(found) for found in traps.values())
+    wrong = len(given) - len(near(list(given))) + sum(row[3] for row in rows)
+    total, asked = len(given) + sum(row[2] for row in rows), len(trials) + sum(row[1] for row in rows)
     summary = f"{wrong} of {total} proposals are false ({asked} were asked for)."
     for name in BACKGROUNDS:
-        corners = near([
-            t.snapped for t in trials if t.kind in ("corner", "cross", "quadrants") and t.background == name
-        ])  # fmt: skip
+        sharp = ("corner", "cross", "quadrants")
+        corners = near([t.snapped for t in trials if t.kind in sharp and t.background == name])
         summary += f" Corners and crosses, {name}: RMS {rms(corners):.3f} px, {covered(corners)} in the 95 % ellipse."
-    print("\n\n".join([snaps, matches, false, summary]))
-    if options.write:
-        write_section(PAGE, "snap", snaps)
-        write_section(PAGE, "match", matches)
-        write_section(PAGE, "false", f"{false}\n\n{summary}")
-
-
-if __name__ == "__main__":
-    main()
+    yield from ["", summary]

@@ -1,21 +1,19 @@
 """Rigs from landmarks whose marks are worse than stated, beside many good matches and a tape, repeated by simulation.
 
-    python -m scripts.check.misstated [--draws 40] [--write]
-
 Twelve surveyed landmarks are marked with some times the error that is stated; 300 matches of unknown range and a tape
 of ± 5 mm are as stated. In the last rows the tape is wrong instead, which must be named whatever the marks are. Seeds
-are fixed. With --write the table of docs/measured/rig.md is made.
+are fixed.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
+from collections.abc import Iterator
 
 import torch
 
-from kcal import Baseline, Features, InputError, RigData, solve_rig
+from kcal import Baseline, InputError, RigData, solve_rig
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens import vector_from_rotation
 from scripts.check.rig import (
@@ -27,11 +25,14 @@ from scripts.check.rig import (
     TRUTH,
     generator,
     landmarks,
+    matches_of,
     normal,
     seen,
     spread,
 )
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.sections import section
+from scripts.shared.timing import rms
 
 MATCHES, TAPE = 300, 0.005
 
@@ -41,13 +42,7 @@ def data(times: float, tape: float, seed: int) -> RigData:
     draw = generator(seed)
     marked = landmarks(draw)
     points = spread(MATCHES, 300.0, 8000.0, draw)
-    matches = Features(
-        names=tuple(map(str, range(MATCHES))),
-        pixels=seen(points) + MARK * normal((MATCHES, 2, 2), draw),
-        inverse_range=torch.zeros(MATCHES, dtype=torch.float64),
-        inverse_range_sigma=torch.full((MATCHES,), math.inf, dtype=torch.float64),
-        pixel_sigma=MARK,
-    )
+    matches = matches_of(seen(points) + MARK * normal((MATCHES, 2, 2), draw))
     length = BASELINE * tape + TAPE * float(normal((1,), draw))
     worse = marked.pixels + math.sqrt(times**2 - 1.0) * MARK * normal((len(marked.names), 2, 2), draw)
     return RigData(
@@ -84,23 +79,15 @@ def judged(times: float, tape: float, draws: int) -> list[str]:
         return [*what, str(draws), str(refused), str(blamed), "–", "–", "–"]
     each = torch.stack(off)
     inside = 100 * float((each.abs() < 1.96).double().mean())
-    rms, factor = float(each.square().mean().sqrt()), math.sqrt(sum(t * t for t in told) / len(told))
-    return [*what, str(draws), str(refused), str(blamed), f"{factor:.2f}", f"{rms:.2f}", f"{inside:.0f} %"]
+    off_by, factor = rms(each), rms(told)
+    return [*what, str(draws), str(refused), str(blamed), f"{factor:.2f}", f"{off_by:.2f}", f"{inside:.0f} %"]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=40)
-    parser.add_argument("--write", action="store_true", help="write the table of docs/measured/rig.md")
-    options = parser.parse_args()
+@section("rig.md", "misstated", draws=1)
+def misstated(draws: int = 40) -> Iterator[str]:
     heads = [
         "marks worse than stated, times", "tape", "rigs", "refused", "the tape blamed", "the landmarks' residuals / σ",
         "error of attitude / σ", "inside 95 %",
     ]  # fmt: skip
     cases = [(1.0, 1.0), (2.0, 1.0), (3.0, 1.0), (5.0, 1.0), (1.0, 1.02), (3.0, 1.02), (3.0, 1.1)]
-    rows = [judged(times, tape, options.draws) for times, tape in cases]
-    tell("rig.md", "misstated", table(heads, rows), write=options.write)
-
-
-if __name__ == "__main__":
-    main()
+    return table(heads, (judged(times, tape, draws) for times, tape in cases))

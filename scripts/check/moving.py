@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -25,7 +25,8 @@ from kcal import Baseline, Camera, KcalError, MeasuredPosition, RigData, solve_r
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.locate.moving import CLOCK, MovingOptions, MovingTrack, Sighting, match_moving
 from scripts.shared.page import table
-from scripts.shared.sections import run, section
+from scripts.shared.sections import section
+from scripts.shared.timing import rms
 
 CAMERA = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
 CENTERS = torch.tensor([[0.0, 0, 0], [10.0, 0, 0]], dtype=torch.float64)
@@ -199,9 +200,6 @@ def row_of(name: str, seeds: int) -> list[str]:
             refused += 1
     value = torch.tensor(found, dtype=torch.float64)
 
-    def rms(x: Tensor) -> float:
-        return float(x.square().mean().sqrt())
-
     inside = float((value[:, 0].abs() < 1.96 * value[:, 1]).double().mean())
     known = float((value[:, 3].abs() < 1.96 * value[:, 4]).double().mean())
     return [
@@ -219,9 +217,5 @@ HEADS = (
 
 
 @section("moving.md", "moving", kinds=tuple(KINDS)[:1], seeds=1)
-def moving(kinds: tuple[str, ...] = tuple(KINDS), seeds: int = 30) -> list[str]:
-    return table(HEADS, [row_of(name, seeds) for name in kinds])
-
-
-if __name__ == "__main__":
-    run()
+def moving(kinds: tuple[str, ...] = tuple(KINDS), seeds: int = 30) -> Iterator[str]:
+    return table(HEADS, (row_of(name, seeds) for name in kinds))

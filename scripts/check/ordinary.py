@@ -1,8 +1,5 @@
 """The default camera on captures that people really have: whole, and halves against halves, beside OpenCV and mrcal.
 
-    KCAL_DATA=DATA python -m scripts.check.ordinary --out FILE          # all captures; those that FILE has are kept
-    KCAL_DATA=DATA python -m scripts.check.ordinary --out FILE ch1280 other.obs.json
-    KCAL_DATA=DATA python -m scripts.check.ordinary --out FILE --write  # the table of docs/measured/ordinary.md
     KCAL_MRCAL=/usr/bin/python3 ...                                     # mrcal's spline, too
 
 Whole: refused or not, RMS, what `kcal report` answers where nothing is required, and the worst that is said. Each
@@ -15,18 +12,15 @@ state, p is the chance of more. A model that was not measured has no column.
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import statistics
 import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
-import torch
 
 from kcal import Camera, KcalError
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
@@ -34,19 +28,18 @@ from kcal.lens import camera_difference
 from kcal.report import camera_verdict
 from scripts.shared.held_out import Projection, held_out
 from scripts.shared.mrcal_camera import splined_camera
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
 from scripts.shared.peer_lenses import fisheye, opencv
-from scripts.shared.real_captures import RealCapture, data_folder, load, names
-from scripts.shared.records import Record, finish
+from scripts.shared.real_captures import RealCapture, load, names
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 
-PAGE = "ordinary.md"
 MODELS = ("kcal", "opencv5", "opencv8", "fisheye", "mrcal")
 LEAST_P, RATIOS, WORST = 0.01, (0.5, 1.2), 1.04
 
 
-def judged(name: str, cache: Path) -> Record:
+def judged(name: str) -> Record:
     """Both halves of one capture, by all models."""
-    capture = load(name, data_folder(), cache)
+    capture = load(name)
     halves = capture.half(0), capture.half(1)
     record: Record = {"whole": _whole(capture), "views": [len(half.seen.views) for half in halves], "held": {}}
     kcal = _defaults(halves, record)
@@ -171,29 +164,9 @@ def _short(record: Record) -> str:
     return Path(record["key"][0]).name.removesuffix(".obs.json")
 
 
-def line(record: Record) -> str:
-    """One line to print."""
-    between = f"ratio {record['ratio']:.2f} p {record['p']:.2g}" if "ratio" in record else f"{record['refused']}"
-    held = ", ".join(f"{model} {shown(one)}" for model, one in record["held"].items())
-    return f"{record['views']} {between}; {held}"
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("captures", nargs="*", help="names, or observations files; all if left out")
-    parser.add_argument("--out", type=Path, required=True, help="JSON lines of finished captures")
-    cache = Path(tempfile.gettempdir(), "kcal-ordinary-corners")
-    parser.add_argument("--cache", type=Path, default=cache, help="folder of corners found in images")
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)  # sums in one order, so that a run can be repeated
-    wanted = arguments.captures or names(data_folder())
-    records = finish(arguments.out, [(name,) for name in wanted], lambda name: judged(name, arguments.cache), line)
-    order = {name: place for place, name in enumerate(wanted)}
-    records = sorted((r for r in records if r["key"][0] in order), key=lambda r: order[r["key"][0]])
-    tell(PAGE, "real", lines(records), write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+@section("ordinary.md", "real", captures=("sq1280",))
+def real(kept: Kept = NOT_KEPT, captures: tuple[str, ...] = ("all",)) -> list[str]:
+    """Names of captures, or observations files."""
+    wanted = names() if captures == ("all",) else list(captures)
+    records = kept.records([(name,) for name in wanted], judged, lambda one: str(one["held"].get("kcal")))
+    return lines(sorted((r for r in records if r["key"][0] in wanted), key=lambda r: wanted.index(r["key"][0])))

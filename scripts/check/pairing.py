@@ -1,8 +1,5 @@
 """Association and disparity of a detector's boxes on a rendered site, against the truth.
 
-    python -m scripts.check.pairing --write            20 frames; docs/measured/pairing.md
-    python -m scripts.check.pairing --frames 2         quick look
-
 A frame has 30 textured objects from 100 m to 5 km, placed at random so that some hide others, before hills at infinity.
 Objects beyond 1 km are 12 px large with a contrast (four standard deviations) of 30 gray levels. The noise of the
 images moves an edge pixel by 0.3 px: it is 0.3 of the median slope in the objects. Each edge of a box errs by 2 px. 5 %
@@ -11,7 +8,8 @@ of the detections are missing in each image, and as many false ones are added; w
 
 from __future__ import annotations
 
-import argparse
+import functools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -25,9 +23,10 @@ from kcal.rig import RigCovariance
 from kcal.track import Detections, ObjectDisparity
 from scripts.shared.marking_scene import Floats, background
 from scripts.shared.object_scene import Plate, exposed, paint_plate, plate, texture_gradient, true_box
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.sections import section
+from scripts.shared.timing import rms as rms_of
 
-PAGE = "pairing.md"
 SIZE, FOCAL, TARGETS = (1920, 1080), 1600.0, 30
 BOX_EDGE, MISSING, NOISE = 2.0, 0.05, 0.3
 OPTIONS = AssociationOptions(box_sigma=BOX_EDGE / np.sqrt(2), nearest=90.0)
@@ -152,7 +151,7 @@ def disparities(rig: Rig, view: Frame, pairs: list[tuple[int, int]]) -> list[Pai
 
 
 def rms(values: list[float]) -> str:
-    return f"{np.sqrt(np.mean(np.square(values))):.3f}" if values else "none"
+    return f"{rms_of(values):.3f}" if values else "none"
 
 
 def pair_row(name: str, pairs: list[Pair]) -> list[str]:
@@ -166,23 +165,26 @@ def pair_row(name: str, pairs: list[Pair]) -> list[str]:
     ]  # fmt: skip
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", action="store_true", help=f"write docs/measured/{PAGE}")
-    options = parser.parse_args()
-    rig, random = site_rig(), np.random.default_rng(options.seed)
+@functools.cache
+def drawn(frames: int, seed: int) -> tuple[dict[bool, list[Counts]], list[Pair]]:
+    """Counts of each frame, without and with looks, and right pairs."""
+    rig, random = site_rig(), np.random.default_rng(seed)
     counts: dict[bool, list[Counts]] = {False: [], True: []}
     pairs: list[Pair] = []
-    for _ in range(options.frames):
+    for _ in range(frames):
         view = frame(rig, random)
         for looks, some in counts.items():
             count, right = associated(rig, view, looks=looks)
             some.append(count)
         pairs += disparities(rig, view, right)
+    return counts, pairs
+
+
+@section("pairing.md", "association", frames=1)
+def association(frames: int = 20, seed: int = 0) -> Iterator[str]:
+    yield from [f"{frames} frames of {TARGETS} objects.", ""]
     rows = []
-    for looks, some in counts.items():
+    for looks, some in drawn(frames, seed)[0].items():
         total = Counts(*np.sum(some, axis=0).tolist())
         rows.append([
             "geometry, size and looks" if looks else "geometry and size", total.there,
@@ -190,19 +192,13 @@ def main() -> None:
             f"{total.clear_right / total.clear:.1%}", f"{1 - total.clear / total.made:.1%}",
         ])  # fmt: skip
     heads = ["pairs by", "to be found", "precision", "recall", "precision of those not ambiguous", "ambiguous"]
-    first = "\n".join(table(heads, rows))
+    yield from table(heads, rows)
+
+
+@section("pairing.md", "disparity", frames=1)
+def disparity(frames: int = 20, seed: int = 0) -> Iterator[str]:
+    pairs = drawn(frames, seed)[1]
+    binned = {f"{low:g} to {high:g} m": [pair for pair in pairs if low <= pair.depth < high] for low, high in RANGES}
     heads = ["range", "pairs", "by boxes: RMS px", "by matching: RMS px", "1.48 median px", "stated σ px", "in 95 %",
              "beyond 5 σ", "refused"]  # fmt: skip
-    binned = [
-        pair_row(f"{low:g} to {high:g} m", part)
-        for low, high in RANGES if (part := [pair for pair in pairs if low <= pair.depth < high])
-    ]  # fmt: skip
-    second = "\n".join(table(heads, [*binned, pair_row("all", pairs)]))
-    print(f"{first}\n\n{second}")
-    if options.write:
-        write_section(PAGE, "association", f"{options.frames} frames of {TARGETS} objects.\n\n{first}")
-        write_section(PAGE, "disparity", second)
-
-
-if __name__ == "__main__":
-    main()
+    return table(heads, (pair_row(name, part) for name, part in {**binned, "all": pairs}.items() if part))

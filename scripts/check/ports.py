@@ -1,8 +1,5 @@
 """Cameras behind flat windows, in air and under water: whether the port is found, and whether error bars hold.
 
-    python -m scripts.check.ports --out ports.jsonl                       # captures that the file holds are kept
-    python -m scripts.check.ports --out *.jsonl --write                   # the table in docs/measured/one-camera.md
-
 Truth: a central lens (scripts/shared/port.py) without a window, behind one in air, and behind one in water, all rays
 by Snell's law; windows of 5 to 20 mm, 2 to 8 cm before the lens, tilted by up to 5°. 40 views of a board of 11 x 8
 corners, 35 mm apart, some 0.5 to 3.5 m away; corners with 0.1 px of noise. Error bars: how often the true direction of
@@ -11,11 +8,8 @@ a pixel, at infinity in the same medium and after the best rotation, lies in the
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator
 from unittest.mock import patch
 
 import torch
@@ -23,8 +17,9 @@ import torch
 from kcal import Board, CalibrationOptions, Observations
 from kcal.sim.captures import LensLike, sample_board_poses
 from scripts.bench.traced_lenses import measured
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
 from scripts.shared.port import AIR, WATER, PortedCamera, drawn
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.traced import as_observations
 
 MEDIA = {"no window": None, "window in air": AIR, "window in water": WATER}
@@ -42,7 +37,7 @@ def seen_by(camera: LensLike | PortedCamera, seed: int, views: int = VIEWS, sigm
     return as_observations(pixels + noise, camera.size, BOARD)
 
 
-def measure(name: str, seed: int) -> dict[str, Any]:
+def measure(name: str, seed: int) -> Record:
     """One capture, with the port's terms where kcal wants them, and without."""
     camera = drawn(MEDIA[name], seed)
     seen = seen_by(camera, seed)
@@ -51,14 +46,14 @@ def measure(name: str, seed: int) -> dict[str, Any]:
     if after.get("port"):
         with patch("kcal.calibrate.hybrid.fit.pupil_recedes", lambda _: False):
             before = measured(camera, seen, CalibrationOptions())  # type: ignore[arg-type]
-    return {"medium": name, "seed": seed, "before": before, "after": after}
+    return {"before": before, "after": after}
 
 
-def rows(records: list[dict[str, Any]]) -> list[list[str]]:
+def rows(records: list[Record]) -> list[list[str]]:
     """One row for each medium."""
     out = []
     for name in MEDIA:
-        own = [r for r in records if r["medium"] == name]
+        own = [r for r in records if r["key"][0] == name]
         if not own:
             continue
         row = [name, f"{sum(bool(r['after'].get('port')) for r in own)} of {len(own)}"]
@@ -73,25 +68,9 @@ def rows(records: list[dict[str, Any]]) -> list[list[str]]:
     return out
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", nargs="+", type=Path, required=True, help="JSON lines; the first is written to")
-    parser.add_argument("--media", nargs="+", choices=MEDIA, default=list(MEDIA))
-    parser.add_argument("--seeds", nargs="*", type=int, default=list(range(100, 200)))
-    parser.add_argument("--write", action="store_true", help="only write the table into the page")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    records = [json.loads(line) for path in arguments.out if path.exists() for line in path.read_text().splitlines()]
-    known = {(r["medium"], r["seed"]) for r in records}
-    for seed in () if arguments.write else arguments.seeds:
-        for name in arguments.media:
-            if (name, seed) not in known:
-                records.append(measure(name, seed))
-                with arguments.out[0].open("a") as file:
-                    file.write(json.dumps(records[-1]) + "\n")
+@section("one-camera.md", "ports", seeds=range(100, 101), media=("window in water",))
+def ports(
+    kept: Kept = NOT_KEPT, seeds: range = range(100, 200), media: tuple[str, ...] = tuple(MEDIA)
+) -> Iterator[str]:
     head = ["", "port found", "inside where boards reached, %", "beyond, %", "RMS at infinity, px"]
-    tell("one-camera.md", "ports", table(head, rows(records)), write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+    return table(head, rows(kept.records([(name, seed) for seed in seeds for name in media], measure)))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import datetime
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import erfa
@@ -29,7 +29,7 @@ from kcal.lens.views import new_pinhole
 from kcal.locate import Triangulate, enu_to_geodetic, geodetic_to_enu
 from kcal.stars.sky import Air, StarCatalog, observed_directions
 from scripts.shared.page import table
-from scripts.shared.sections import run, section
+from scripts.shared.sections import section
 
 Numbers = Sequence[mpf]
 SIZE = (1920, 1080)
@@ -340,24 +340,20 @@ HEAD = ["quantity", "largest error, float64", "inputs of float32"]
 
 
 @section("precision.md", "lens precision", points=20)
-def lens_precision(points: int = 200) -> list[str]:
+def lens_precision(points: int = 200) -> Iterator[str]:
     return table(HEAD, lens_rows(points))
 
 
 @section("precision.md", "stored precision", points=20)
-def stored_precision(points: int = 200) -> list[str]:
+def stored_precision(points: int = 200) -> Iterator[str]:
     return table(HEAD, table_rows(points))
 
 
 @section("precision.md", "position precision", points=20)
-def position_precision(points: int = 200) -> list[str]:
+def position_precision(points: int = 200) -> Iterator[str]:
     return table(HEAD, pair_rows(points) + geodesy_rows(points) + star_rows())
 
 
 @section("precision.md", "limits")
-def limits() -> list[str]:
+def limits() -> Iterator[str]:
     return table(["what is asked", "answer"], limit_rows())
-
-
-if __name__ == "__main__":
-    run()

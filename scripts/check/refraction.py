@@ -12,6 +12,7 @@ Error without noise: neither survey nor marks have any, so that only the coeffic
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -23,7 +24,7 @@ from kcal.locate.geodesy import enu_from_cam, mean_radius
 from kcal.rig import placed_rig
 from scripts.shared.long_range import ORIGIN, rig
 from scripts.shared.page import table
-from scripts.shared.sections import run, section
+from scripts.shared.sections import section
 
 COUNT, SURVEY, MARK = 12, 0.02, 0.07  # landmarks; meters, px
 TARGET_RANGE = 5000.0
@@ -96,12 +97,8 @@ def heights(place: Site, generator: torch.Generator, noise: float, learned: bool
     return error, spread, solved.refraction
 
 
-def rows(draws: int) -> list[list[str]]:
+def rows(draws: int) -> Iterator[list[str]]:
     """One row for each truth, place of the landmarks and way of solving."""
-    out = [[
-        "true coefficient", "landmarks", "coefficient", "found", "height error at 5 km without noise, m",
-        "with noise, m", "inside the 95 % interval, %",
-    ]]  # fmt: skip
     for name, truth in (("0.33", 0.33), ("-0.07", -0.07), ("0.13 ± 0.1", None)):
         for far in (False, True):
             for learned in (False, True):
@@ -123,18 +120,13 @@ def rows(draws: int) -> list[list[str]]:
                 if not learned:
                     print(f"{name}, {kind}, located with 0.13 ± 0.1: {float(noisy.sqrt()):.3f} m", flush=True)
                     continue
-                out.append([
+                yield [
                     name, kind, f"± {float(off):.3f}", f"{float(rms.sqrt()):.3f}", f"{float(noisy.sqrt()):.3f}",
                     f"{100 * float(share):.1f}",
-                ])  # fmt: skip
-    return out
+                ]  # fmt: skip
 
 
 @section("rig.md", "refraction", draws=2)
-def refraction(draws: int = 40) -> list[str]:
-    head, *body = rows(draws)
-    return table(head, body)
-
-
-if __name__ == "__main__":
-    run()
+def refraction(draws: int = 40) -> Iterator[str]:
+    heads = ["true coefficient", "landmarks", "coefficient", "found", "height error at 5 km without noise, m"]
+    return table([*heads, "with noise, m", "inside the 95 % interval, %"], rows(draws))

@@ -1,17 +1,14 @@
 """Rigs solved from a survey, repeated by simulation: coverage, the price of calibration, wrong landmarks, drift.
 
-    python -m scripts.check.rig [--quick] [--write]
-
 Everything is drawn anew in each repetition: where landmarks and features stand, the survey's errors, the marks' noise.
-Seeds are fixed; nothing here depends on the machine. With --write the page docs/measured/rig.md and its picture are
-made.
+Seeds are fixed; nothing here depends on the machine.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from pathlib import Path
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -24,9 +21,9 @@ from kcal.report import rig_figure, save_picture
 from kcal.rig import RigCovariance
 from kcal.watch.turned import drift_of_turns, measure_drift
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import DOCS
-from scripts.shared.sections import run, section
-from scripts.shared.timing import row, show
+from scripts.shared.page import DOCS, table
+from scripts.shared.sections import section
+from scripts.shared.timing import rms, share
 
 HEADING = 35.0
 MARK, SURVEY = 0.1, 0.02
@@ -90,6 +87,15 @@ def summits(draw: torch.Generator, count: int = 20, known: float = 0.1) -> Featu
     )
 
 
+def matches_of(pixels: Tensor, sigma: float = MARK) -> Features:
+    """Matches (N, V, 2) of unknown range."""
+    nothing = torch.zeros(len(pixels), dtype=torch.float64)
+    return Features(
+        names=tuple(map(str, range(len(pixels)))), pixels=pixels, inverse_range=nothing,
+        inverse_range_sigma=torch.full_like(nothing, math.inf), pixel_sigma=sigma,
+    )  # fmt: skip
+
+
 def data(kind: str, draw: torch.Generator) -> RigData:
     """A survey with more or less besides."""
     marks = landmarks(draw)
@@ -122,8 +128,9 @@ def yaw_error(found: RigResult) -> float:
     return math.degrees(float(vector_from_rotation(relative)[1]))
 
 
+@section("rig.md", "coverage", draws=2)
 @torch.no_grad()
-def coverage(draws: int, marks: int) -> list[str]:
+def coverage(draws: int = 100, marks: int = 50) -> Iterator[str]:
     """Rigs solved anew, and targets marked with them."""
     angles = torch.tensor([-0.3 + 0.1 * i for i in range(len(RANGES))], dtype=torch.float64)
     far = torch.tensor(RANGES, dtype=torch.float64)
@@ -132,13 +139,7 @@ def coverage(draws: int, marks: int) -> list[str]:
     exact = seen(targets)
     best = Localizer(TRUTH, origin=ORIGIN, heading_deg=HEADING, pixel_sigma=MARK)(exact[:, 0], exact[:, 1])
     bound = best.inverse_range_sigma
-    lines = show(
-        [
-            f"| from {len(landmarks(generator(0)).names)} landmarks and | σ of yaw | its error / σ |"
-            + "".join(f" {distance:g} m |" for distance in RANGES),
-            "|---|---|---|" + "---|" * len(RANGES),
-        ]
-    )
+    rows = []
     for kind in (
         "nothing else",
         "a baseline ± 5 mm",
@@ -161,26 +162,22 @@ def coverage(draws: int, marks: int) -> list[str]:
             squares.append((answer.inverse_range - 1.0 / far).square().mean(0))
             yaws.append(yaw_error(found))
             sigmas.append(math.degrees(float(found.relative_covariance()[1, 1].sqrt())))
-        share, ratio = torch.stack(inside), torch.stack(squares).mean(0).sqrt() / bound
-        scatter = math.sqrt(sum((y / s) ** 2 for y, s in zip(yaws, sigmas, strict=True)) / draws)
+        ratio = torch.stack(squares).mean(0).sqrt() / bound
+        scatter = rms([y / s for y, s in zip(yaws, sigmas, strict=True)])
         cells = [
-            f"{100 * float(mean):.1f} ± {100 * float(error):.1f} %; {float(price):.2f}"
-            for mean, error, price in zip(share.mean(0), share.std(0) / draws**0.5, ratio, strict=True)
+            f"{share(each, ' %')}; {float(price):.2f}"
+            for each, price in zip(torch.stack(inside).T.tolist(), ratio, strict=True)
         ]
-        lines += show([row(kind, f"{sum(sigmas) / draws:.5f}°", f"{scatter:.2f}", *cells)])
-    return lines
+        rows.append([kind, f"{sum(sigmas) / draws:.5f}°", f"{scatter:.2f}", *cells])
+    heads = [f"from {len(landmarks(generator(0)).names)} landmarks and", "σ of yaw", "its error / σ"]
+    return table([*heads, *(f"{distance:g} m" for distance in RANGES)], rows)
 
 
+@section("rig.md", "wrong landmark", draws=2)
 @torch.no_grad()
-def wrong(draws: int) -> list[str]:
+def wrong(draws: int = 50) -> Iterator[str]:
     """One landmark of twelve is wrong."""
-    lines = show(
-        [
-            "| wrong by | named and left out | good ones left out, a rig | RMS error of yaw, all kept "
-            "| wrong one left out | never wrong |",
-            "|---|---|---|---|---|---|",
-        ]
-    )
+    rows = []
     for kind, size in (("mark", 0.5), ("mark", 1.0), ("mark", 2.0), ("mark", 5.0), ("height", 1.0), ("height", 5.0)):
         named, false = 0, 0
         errors: list[list[float]] = [[], [], []]
@@ -200,11 +197,11 @@ def wrong(draws: int) -> list[str]:
             errors[0].append(yaw_error(solve_rig(bad, dataclasses.replace(STRAIGHT, reject=False))))
             errors[1].append(yaw_error(found))
             errors[2].append(yaw_error(solve_rig(good, STRAIGHT)))
-        rms = [math.sqrt(sum(e * e for e in each) / draws) for each in errors]
         label = f"{size:g} px in one image" if kind == "mark" else f"{size:g} m of height"
-        cells = [f"{value:.5f}°" for value in rms]
-        lines += show([row(label, f"{100 * named / draws:.0f} %", f"{false / draws:.3f}", *cells)])
-    return lines
+        cells = [f"{rms(each):.5f}°" for each in errors]
+        rows.append([label, f"{100 * named / draws:.0f} %", f"{false / draws:.3f}", *cells])
+    heads = ["wrong by", "named and left out", "good ones left out, a rig", "RMS error of yaw, all kept"]
+    return table([*heads, "wrong one left out", "never wrong"], rows)
 
 
 @torch.no_grad()
@@ -214,15 +211,10 @@ def found_at_5_km(old: Rig, new: Rig) -> float:
     return float(dataclasses.replace(still, rig=new).effect((5000.0,)).found[0])
 
 
-def drift(draws: int) -> list[str]:
+@section("rig.md", "turned", draws=2)
+def drift(draws: int = 50) -> Iterator[str]:
     """The right camera turns by 0.01°; points that do not move, then and now, or landmarks."""
-    lines = show(
-        [
-            "| seen | RMS error of the yaw | mean σ | within 0.001° | called significant | the same without drift "
-            "| 5 km with the old rig | RMS at 5 km, corrected |",
-            "|---|---|---|---|---|---|---|---|",
-        ]
-    )
+    rows = []
     yaw = math.radians(0.01)
     still = torch.zeros(2, 3, dtype=torch.float64)
     turned = torch.tensor([[0.0, 0.0, 0.0], [0.0, yaw, 0.0]], dtype=torch.float64)
@@ -244,13 +236,7 @@ def drift(draws: int) -> list[str]:
         points = spread(count, 300.0, 8000.0, draw)
         then = seen(points) + MARK / images**0.5 * normal((count, 2, 2), draw)
         after = seen(points, turns) + MARK / images**0.5 * normal((count, 2, 2), draw)
-        features = Features(
-            names=tuple(map(str, range(count))),
-            pixels=torch.cat([then, after], 1),
-            inverse_range=torch.zeros(count, dtype=torch.float64),
-            inverse_range_sigma=torch.full((count,), math.inf, dtype=torch.float64),
-            pixel_sigma=MARK / images**0.5,
-        )
+        features = matches_of(torch.cat([then, after], 1), MARK / images**0.5)
         found = measure_drift(TRUTH, features=features)
         return found.relative, found.relative_covariance, found.significant, found.rig
 
@@ -269,21 +255,18 @@ def drift(draws: int) -> list[str]:
             significant += told
             after.append(found_at_5_km(corrected, later) - 5000.0)
             false += check(count, still, seed + draws, images)[2]
-        rms = math.sqrt(sum(e * e for e in errors) / draws)
         within = sum(abs(e) < 0.001 for e in errors) / draws
-        lines += show(
-            [
-                row(
-                    label, f"{rms:.5f}°", f"{sum(sigmas) / draws:.5f}°", f"{100 * within:.0f} %",
-                    f"{100 * significant / draws:.0f} %", f"{100 * false / draws:.1f} %", f"{before:+.0f} m",
-                    f"{math.sqrt(sum(a * a for a in after) / draws):.0f} m",
-                )
-            ]
-        )  # fmt: skip
-    return lines
+        rows.append([
+            label, f"{rms(errors):.5f}°", f"{sum(sigmas) / draws:.5f}°", f"{100 * within:.0f} %",
+            f"{100 * significant / draws:.0f} %", f"{100 * false / draws:.1f} %", f"{before:+.0f} m",
+            f"{rms(after):.0f} m",
+        ])  # fmt: skip
+    heads = ["seen", "RMS error of the yaw", "mean σ", "within 0.001°", "called significant", "the same without drift"]
+    return table([*heads, "5 km with the old rig", "RMS at 5 km, corrected"], rows)
 
 
-def example(path: Path) -> None:
+@section("rig.md", "picture")
+def example(write: bool = False) -> None:
     """A picture of a rig with a wrong landmark and a wrong match."""
     draw = generator(4)
     sources = data("baseline and positions and summits", draw)
@@ -291,29 +274,5 @@ def example(path: Path) -> None:
     assert sources.features is not None
     sources.landmarks.points[4, 2] += 2.0
     sources.features.pixels[7, 1, 1] += 2.0
-    save_picture(path, rig_figure(solve_rig(sources, STRAIGHT)))
-
-
-@section("rig.md", "coverage", draws=2)
-def coverage_rows(draws: int = 100) -> list[str]:
-    return coverage(draws, 50)
-
-
-@section("rig.md", "wrong landmark", draws=4)
-def wrong_landmark(draws: int = 100) -> list[str]:
-    return wrong(draws // 2)
-
-
-@section("rig.md", "turned", draws=4)
-def turned(draws: int = 100) -> list[str]:
-    return drift(draws // 2)
-
-
-@section("rig.md", "picture")
-def picture(write: bool = False) -> None:
     if write:
-        example(DOCS / "rig.png")
-
-
-if __name__ == "__main__":
-    run()
+        save_picture(DOCS / "rig.png", rig_figure(solve_rig(sources, STRAIGHT)))

@@ -26,20 +26,14 @@ from kcal.io.formats import FORMATS
 from kcal.lens import CameraCalibration, export_cameras, import_cameras
 from scripts.check.exchange import (
     ask,
-    by_basalt,
-    by_kalibr,
-    by_matlab,
-    by_multical,
-    by_nerfstudio,
-    by_opencv,
-    by_opensfm,
     opencv_formula,
     peer,
     random_points,
+    readers_of,
     sample_camera,
 )
 from scripts.shared.page import table
-from scripts.shared.sections import run, section
+from scripts.shared.sections import section
 
 HEADS = ["program", "direction", "lens", "σ", "pupil", "board", "largest error, px", "reader"]
 K, D = np.array([[1000.1, 0, 640.3], [0, 1001.3, 359.2], [0, 0, 1]]), np.array([-0.2, 0.05, 1e-3, -2e-3, 0.01])
@@ -138,23 +132,14 @@ def by_aniposelib(path: Path, points: np.ndarray) -> np.ndarray:
 
 
 def out_rows(folder: Path, mrcal: str | None) -> Iterator[Row]:
-    readers: dict[str, tuple[str, str, Callable[[Path, np.ndarray], np.ndarray]]] = {
-        "opencv": ("c.yaml", "cv2.FileStorage, cv2.projectPoints", by_opencv),
-        "kalibr": ("k.yaml", "PyYAML, cv2.projectPoints", by_kalibr),
-        "nerfstudio": ("transforms.json", "json, cv2.projectPoints", by_nerfstudio),
-        "matlab": ("m.mat", "SciPy, MATLAB's documented formula", by_matlab),
-        "opensfm": ("camera_models.json", "json, cv2.projectPoints", by_opensfm),
+    readers = readers_of(mrcal or "", "", "") | {
         "colmap": ("cameras.txt", "pycolmap", by_pycolmap),
-        "basalt": ("basalt.json", "json, cv2.projectPoints", by_basalt),
-        "multical": ("multical.json", "json, cv2.projectPoints", by_multical),
         "gtsam": ("g.json", "gtsam", by_gtsam),
         "ceres": ("ceres.json", "json, cv2.projectPoints", by_ceres),
         "numpy": ("n.npz", "numpy, cv2.projectPoints", by_numpy),
         "bag": ("calibration.mcap", "rosbags, cv2.projectPoints", by_rosbags),
         "toml": ("anipose.toml", "aniposelib", by_aniposelib),
     }
-    if mrcal:
-        readers["mrcal"] = ("m.cameramodel", "mrcal", peer(mrcal, "mrcal"))
     for name, (file, reader, project) in readers.items():
         camera = known(
             max((m for m in FORMATS[name].models if m != "fisheye4"), key=lambda m: len(sample_camera(m).names))
@@ -309,10 +294,6 @@ def in_rows(folder: Path, mrcal: str | None) -> Iterator[Row]:
 
 
 @section("other-programs.md", "round trips")
-def round_trips(mrcal: str = "") -> list[str]:
+def round_trips(mrcal: str = "") -> Iterator[str]:
     with tempfile.TemporaryDirectory() as name:
         return table(HEADS, [*out_rows(Path(name), mrcal or None), *in_rows(Path(name), mrcal or None)])
-
-
-if __name__ == "__main__":
-    run()

@@ -1,27 +1,21 @@
 """Rigs from the scene itself: matches against the truth, yaw from one and ten pairs, ranges at 5 km.
 
-    python -m scripts.check.scene yaw --scale 0.5 --seeds 0-29 --out build/yaw.jsonl [--write]
-    python -m scripts.check.scene ranges --seeds 0-29 --out build/ranges.jsonl [--write]
-    python -m scripts.check.scene matches common speed picture [--write]
-
 Pictures of a terrain (`scripts.shared.terrain`) by two traced lenses. `yaw`: each seed is another terrain, and its
 ten pairs of a minute and of a day are rendered and matched; --scale makes the pictures smaller (1: 1920 x 1080, f 1600
 px) and so affordable. `matches`: what is found under several conditions, beside OpenCV's SIFT and USAC. `common`:
 errors that matches share. `ranges`: places and covariances are those of one rendered pair, and errors are drawn anew
-for each seed. `speed`: CPU seconds of the adjustment. Runs of `yaw` and `ranges` go on where they stopped. With --write
-docs/measured/scene.md is made.
+for each seed. `speed`: CPU seconds of the adjustment.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import functools
 import math
 import pickle
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -47,10 +41,10 @@ from kcal.sim.captures import TrueRig, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM
 from scripts.shared.long_range import ORIGIN
-from scripts.shared.page import DOCS, table, tell
-from scripts.shared.records import Record, finish, read, seeds
+from scripts.shared.page import DOCS, table
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.terrain import Terrain, Weather
-from scripts.shared.timing import show
+from scripts.shared.timing import share
 from scripts.shared.traced import as_camera, capture
 
 TAPE = 0.005  # meters
@@ -156,25 +150,35 @@ def visible_keypoints(pair: ImagePair, moment: int, weather: Weather) -> int:
     return int((inside & same & ~moving).sum())
 
 
+@section("scene.md", "matches", conditions=("clear noon",))
 @torch.no_grad()
-def matches() -> list[str]:
+def matches(conditions: tuple[str, ...] = tuple(CONDITIONS)) -> Iterator[str]:
     """Matches under several conditions against the truth."""
-    lines = show(
-        [
-            "| condition | by | matches | wrong | off the line | of visible | RMS across, px | over its σ | CPU s |",
-            "|---|---|---|---|---|---|---|---|---|",
-        ]
-    )
+    heads = [
+        "condition",
+        "by",
+        "matches",
+        "wrong",
+        "off the line",
+        "of visible",
+        "RMS across, px",
+        "over its σ",
+        "CPU s",
+    ]
+    yield from table(heads, match_rows(conditions))
 
-    def told(condition: str, by: str, found: Judged, seconds: float) -> None:
-        sigmas = "" if math.isnan(found.sigmas) else f"{found.sigmas:.2f}"
-        lines.extend(show([
-            f"| {condition} | {by} | {found.number} | {100 * found.wrong / found.number:.1f} % "
-            f"| {100 * found.beside / found.number:.1f} % | {100 * found.recall:.0f} % "
-            f"| {found.across:.3f} | {sigmas} | {seconds:.1f} |"
-        ]))  # fmt: skip
 
-    for condition, weathers in CONDITIONS.items():
+def told(condition: str, by: str, found: Judged, seconds: float) -> list[object]:
+    sigmas = "" if math.isnan(found.sigmas) else f"{found.sigmas:.2f}"
+    return [
+        condition, by, found.number, f"{100 * found.wrong / found.number:.1f} %",
+        f"{100 * found.beside / found.number:.1f} %", f"{100 * found.recall:.0f} %", f"{found.across:.3f}", sigmas,
+        f"{seconds:.1f}",
+    ]  # fmt: skip
+
+
+def match_rows(conditions: tuple[str, ...]) -> Iterator[list[object]]:
+    for condition, weathers in ((name, CONDITIONS[name]) for name in conditions):
         # The first last: its pictures are then at hand.
         pairs = [photographed(SCENE, moment, weathers[moment - 1]) for moment in (3, 2, 1)][::-1]
         visible = visible_keypoints(pairs[0], 1, weathers[0])
@@ -182,26 +186,20 @@ def matches() -> list[str]:
         try:
             found = [match_scene(exact(HALF), pair) for pair in pairs]
         except InputError:
-            lines.extend(show([f"| {condition} | kcal | refused | | | | | | |"]))
+            yield [condition, "kcal", "refused", *[""] * 6]
         else:
             seconds = (time.process_time() - start) / 3
-            told(
-                condition,
-                "kcal, one pair",
-                judged(found[0].pixels, found[0].covariance, 1, weathers[0], visible),
-                seconds,
-            )
+            one = judged(found[0].pixels, found[0].covariance, 1, weathers[0], visible)
+            yield told(condition, "kcal, one pair", one, seconds)
             scene = scene_of(exact(HALF), pairs, found)
             seconds = (time.process_time() - start) / 3
             own = slice(0, scene.counts[0].used)
             of_three = judged(scene.features.pixels[own], None, 1, weathers[0], visible)
-            told(condition, "kcal, three pairs", of_three, seconds)
+            yield told(condition, "kcal, three pairs", of_three, seconds)
         start = time.process_time()
         pixels = opencv_matches(pairs[0])
-        told(
-            condition, "OpenCV SIFT + USAC", judged(pixels, None, 1, weathers[0], visible), time.process_time() - start
-        )
-    return lines
+        spent = time.process_time() - start
+        yield told(condition, "OpenCV SIFT + USAC", judged(pixels, None, 1, weathers[0], visible), spent)
 
 
 @functools.cache
@@ -240,10 +238,6 @@ def rig_data(cameras: tuple[Camera, Camera], features: Features, draw: torch.Gen
     return RigData(cameras=cameras, names=NAMES, features=features, baselines=(tape,))
 
 
-YAW_HEADS = (
-    "pictures, px", "pairs", "matches", "terrains", "bound of noise", "σ of yaw", "RMS error", "over σ", "inside 95 %",
-    "pose χ² of 3",
-)  # fmt: skip
 T = TypeVar("T")
 
 
@@ -309,9 +303,8 @@ def yaw_of(scale: float, count: int, times: str, seed: int, folder: Path) -> Rec
     return record
 
 
-def yaw_rows(records: list[Record]) -> list[list[str]]:
+def yaw_rows(records: list[Record]) -> Iterator[list[str]]:
     """Rows of the table, of all records."""
-    rows = []
     found = {(one["key"][0], name) for one in records for name in one if name != "key"}
     for scale, name in sorted(found, key=lambda each: (each[0], each[1][-3:] == "day", int(each[1].split()[0]))):
         # A terrain may be in runs of few and of many pairs.
@@ -320,31 +313,31 @@ def yaw_rows(records: list[Record]) -> list[list[str]]:
             np.array([one[part] for one in own]) for part in ("error", "sigma", "chi2", "matches", "bound")
         )
         z = error / sigma
-        rows.append([
+        yield [
             f"{1920 * scale:.0f} x {1080 * scale:.0f}", name, f"{count.mean():.0f}", f"{len(own)}",
             f"{bound.mean():.5f}°", f"{sigma.mean():.5f}°", f"{np.sqrt(np.square(error).mean()):.5f}°",
             f"{np.sqrt(np.square(z).mean()):.2f}", f"{100 * (np.abs(z) < 1.96).mean():.0f} %", f"{chi2.mean():.1f}",
-        ])  # fmt: skip
-    return rows
+        ]  # fmt: skip
 
 
 BLOCK = 120.0  # px
 
 
+@section("scene.md", "common", moments=2)
 @torch.no_grad()
-def common() -> list[str]:
+def common(moments: int = 6) -> Iterator[str]:
     """Whether means of errors over parts of the image are as large as stated, with and without what matches share.
 
     The scene stands still, and pairs differ by noise alone and by vehicles. Each part's weighted mean of
     distances from epipolar lines is compared with its standard deviation.
     """
     terrain = Terrain(rig_of(HALF), 2)
-    pairs = [photographed(terrain, moment) for moment in range(6)]
+    pairs = [photographed(terrain, moment) for moment in range(moments)]
     found = [match_scene(exact(HALF), pair) for pair in pairs]
     rows = []
-    for count in (1, 3, 6):
+    for count in [number for number in (1, 3, 6) if number <= moments]:
         z: tuple[list[float], list[float]] = [], []
-        for first in range(0, 7 - count, count):
+        for first in range(0, moments + 1 - count, count):
             some = found[first : first + count]
             parts = [[getattr(one, part) for one in some] for part in ("pixels", "covariance", "share")]
             lines = [line_errors(one.rig, one.pixels) for one in some]
@@ -403,9 +396,6 @@ def at_five_km(found: RigResult, draw: torch.Generator) -> tuple[Tensor, Tensor]
     return 5000.0 * where.inverse_range - 1.0, 5000.0 * where.inverse_range_sigma
 
 
-RANGE_HEADS = ("corners, px", "from", "rigs", "RMS error at 5 km", "mean σ", "over σ", "inside 95 %")
-
-
 @torch.no_grad()
 def ranges_of(corner: float, seed: int) -> Record:
     """Relative errors at 5 km and their σ with calibrated lenses: from landmarks, from the scene, from both."""
@@ -425,27 +415,25 @@ def ranges_of(corner: float, seed: int) -> Record:
     return record
 
 
-def range_rows(records: list[Record]) -> list[list[str]]:
+def range_rows(records: list[Record]) -> Iterator[list[str]]:
     """Rows of the table."""
-    rows = []
     for corner in sorted({record["key"][0] for record in records}):
         own = [record for record in records if record["key"][0] == corner]
         for name in ("12 landmarks", "one pair and a tape", "both"):
             error, sigma = (np.array([record[name][part] for record in own]) for part in ("error", "sigma"))
             inside = (np.abs(error / sigma) < 1.96).mean(1)
-            spread = inside.std(ddof=1) / math.sqrt(len(own)) if len(own) > 1 else math.nan
-            rows.append([
+            yield [
                 f"{corner}", name, f"{len(own)}", f"{100 * np.sqrt(np.square(error).mean()):.1f} %",
                 f"{100 * sigma.mean():.1f} %", f"{np.sqrt(np.square(error / sigma).mean()):.2f}",
-                f"{100 * inside.mean():.0f} ± {100 * spread:.0f} %",
-            ])  # fmt: skip
-    return rows
+                share(inside.tolist(), " %"),
+            ]  # fmt: skip
 
 
+@section("scene.md", "speed", counts=(200,))
 @torch.no_grad()
-def speed() -> list[str]:
+def speed(counts: tuple[int, ...] = (2000, 20_000)) -> Iterator[str]:
     """CPU seconds of the adjustment with calibrated lenses."""
-    counts, spent = (2000, 20_000), list[float]()
+    spent = list[float]()
     cameras = tuple(calibrate_camera(capture(lens, 20, 0.05, k)).camera for k, lens in enumerate((RIG.left, RIG.right)))
     for count in counts:
         draw = torch.Generator().manual_seed(1)
@@ -465,8 +453,11 @@ def speed() -> list[str]:
     return table(("matches", "CPU s", "times the first"), rows)
 
 
-def picture() -> None:
+@section("scene.md", "picture")
+def picture(write: bool = False) -> None:
     """Matches of a pair on the left image, by their range: docs/howto/scene.png."""
+    if not write:
+        return
     import matplotlib
 
     matplotlib.use("Agg")
@@ -493,43 +484,24 @@ def picture() -> None:
     figure.savefig(DOCS.parent / "howto" / "scene.png", dpi=100)
 
 
-def repeated(part: str, given: argparse.Namespace) -> list[str]:
-    """The table of a simulation of many seeds, which goes on where it stopped."""
-    if given.out is None:
-        raise SystemExit(f"{part}: --out FILE is needed")
-    work, rows, heads = (yaw_of, yaw_rows, YAW_HEADS) if part == "yaw" else (ranges_of, range_rows, RANGE_HEADS)
-    first: list[tuple[object, ...]] = [(0.05,), (0.2,)]
-    if part == "yaw":
-        first = [(given.scale, given.pairs, times) for times in given.times]
-        work = functools.partial(yaw_of, folder=given.cache)
-
-    def brief(record: Record) -> str:
-        return " ".join(f"{name} {np.mean(value['sigma']):.2g}" for name, value in record.items() if name != "key")
-
-    finish(given.out, [(*one, seed) for seed in seeds(given.seeds) for one in first], work, brief)
-    return table(heads, rows(read([given.out, *given.more])))
+@section("scene.md", "yaw", seeds=range(1), scale=0.25, pairs=1, times=("minute",))
+def yaw(
+    kept: Kept = NOT_KEPT, seeds: range = range(30), scale: float = 0.5, pairs: int = 10,
+    times: tuple[str, ...] = ("minute", "day"), folder: Path = Path("build/scene"),
+) -> Iterator[str]:  # fmt: skip
+    """Of so many pairs of a minute and of a day; pictures and their matches stay in a folder."""
+    keys = [(scale, pairs, when, seed) for seed in seeds for when in times]
+    heads = ["pictures, px", "pairs", "matches", "terrains", "bound of noise", "σ of yaw", "RMS error", "over σ"]
+    records = kept.records(keys, functools.partial(yaw_of, folder=folder), _brief)
+    return table([*heads, "inside 95 %", "pose χ² of 3"], yaw_rows(records))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="+", choices=("matches", "common", "yaw", "ranges", "speed", "picture"))
-    parser.add_argument("--seeds", default="0-29")
-    parser.add_argument("--scale", type=float, default=0.5, help="of the pictures of yaw")
-    parser.add_argument("--pairs", type=int, default=10, help="of a minute and of a day, for yaw")
-    parser.add_argument("--times", nargs="+", choices=("minute", "day"), default=["minute", "day"], help="of yaw")
-    parser.add_argument("--out", type=Path, help="records of yaw or of ranges")
-    parser.add_argument("--cache", type=Path, default=Path("build/scene"), help="folder of yaw's pictures and matches")
-    parser.add_argument("--more", type=Path, nargs="*", default=[], help="records of other runs for the same table")
-    parser.add_argument("--write", action="store_true")
-    given = parser.parse_args()
-    torch.set_num_threads(1)
-    for part in given.parts:
-        if part == "picture":
-            picture()
-        else:
-            whole = {"matches": matches, "common": common, "speed": speed}
-            tell("scene.md", part, whole[part]() if part in whole else repeated(part, given), write=given.write)
+@section("scene.md", "ranges", seeds=range(1), corners=(0.05,))
+def ranges(kept: Kept = NOT_KEPT, seeds: range = range(30), corners: tuple[float, ...] = (0.05, 0.2)) -> Iterator[str]:
+    records = kept.records([(corner, seed) for seed in seeds for corner in corners], ranges_of, _brief)
+    heads = ["corners, px", "from", "rigs", "RMS error at 5 km", "mean σ", "over σ", "inside 95 %"]
+    return table(heads, range_rows(records))
 
 
-if __name__ == "__main__":
-    main()
+def _brief(record: Record) -> str:
+    return " ".join(f"{name} {np.mean(value['sigma']):.2g}" for name, value in record.items() if name != "key")

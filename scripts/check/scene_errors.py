@@ -10,6 +10,7 @@ in every pair of that light. Weights are those of noise and of 0.08 px. With --w
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +25,9 @@ from kcal.scene.match import guided_matches
 from kcal.scene.refine import refine_matches
 from scripts.check.scene import HALF, WRONG, exact, rig_of
 from scripts.shared.page import table
-from scripts.shared.sections import run, section
+from scripts.shared.sections import section
 from scripts.shared.terrain import Terrain, Weather
+from scripts.shared.timing import rms
 
 KINDS = ("level ground", "hills and walls", "edges before something farther")
 BESIDE = 0.08  # px, added to the σ of each match in weights
@@ -82,10 +84,6 @@ def errors_of(seed: int) -> Errors:
     return Errors(kind[good], lines[0].off, lines[1].off, sigma, yaw.rad2deg())
 
 
-def rms(values: Tensor) -> float:
-    return float(values.square().mean().sqrt())
-
-
 def rows(found: list[Errors]) -> list[list[str]]:
     """Rows of the table."""
     every = Errors(*(torch.cat(parts) for parts in zip(*found, strict=True)))
@@ -106,9 +104,5 @@ HEADS = ("what", "matches", "RMS, px", "σ of noise", "of it repeats, RMS", "med
 
 
 @section("scene.md", "repeats", seeds=range(700, 701))
-def repeats(seeds: range = range(700, 712)) -> list[str]:
+def repeats(seeds: range = range(700, 712)) -> Iterator[str]:
     return table(HEADS, rows([errors_of(seed) for seed in seeds]))
-
-
-if __name__ == "__main__":
-    run()

@@ -17,9 +17,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tempfile
 import time
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import cv2
@@ -35,8 +34,7 @@ from kcal.sim.raytrace import Misalignment, focal_length, system_matrix
 from kcal.sim.truth import TruthLens
 from scripts.shared.page import table
 from scripts.shared.prescriptions import MACHINE_VISION
-from scripts.shared.records import Record, finish
-from scripts.shared.sections import run, section
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.traced import BOARD, captures, printed
 
 LENS = MACHINE_VISION
@@ -153,7 +151,7 @@ def _root(draws: list[dict[str, Any]], way: str, what: str) -> float:
     return math.sqrt(np.mean([draw[way][what] for draw in draws]))
 
 
-def lines(records: list[Record], noises: int) -> list[str]:
+def lines(records: list[Record], noises: int) -> Iterator[str]:
     """The table of the page."""
     names = {
         "five": "interpolated from five",
@@ -187,13 +185,8 @@ def lines(records: list[Record], noises: int) -> list[str]:
 
 
 @section("settings.md", "settings", lenses=1, noises=1)
-def settings(kinds: tuple[str, ...] = ("zoom", "focus"), lenses: int = 10, noises: int = 3) -> list[str]:
-    keys = [(kind, seed, noises) for seed in range(lenses) for kind in kinds]
-    records = finish(Path(tempfile.gettempdir(), "kcal-settings", "settings.jsonl"), keys, work, shown)
-    wanted = [list(key) for key in keys]
-    found = sorted((one for one in records if one["key"] in wanted), key=lambda one: wanted.index(one["key"]) % 2)
-    return lines(found, noises)
-
-
-if __name__ == "__main__":
-    run()
+def settings(
+    kept: Kept = NOT_KEPT, kinds: tuple[str, ...] = ("zoom", "focus"), lenses: int = 10, noises: int = 3
+) -> Iterator[str]:
+    found = kept.records([(kind, seed, noises) for kind in kinds for seed in range(lenses)], work, shown)
+    return lines([record for record in found if record["key"][2] == noises], noises)

@@ -1,19 +1,11 @@
-"""Attitude from skylines in simulation: errors over their σ, coverage, what trees and wrong statements do.
-
-    python -m scripts.check.skyline alone 30 --write
-    python -m scripts.check.skyline rigs 30 --write
-
-Trials that are done are kept in skyline-alone.jsonl and skyline-rigs.jsonl in KCAL_TRIALS (here if not set).
-"""
+"""Attitude from skylines in simulation: errors over their σ, coverage, what trees and wrong statements do."""
 
 from __future__ import annotations
 
-import argparse
+import functools
 import math
-import os
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -25,8 +17,8 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from kcal.rig import RasterError, SkylineImage, skyline_attitude, skyline_source
-from scripts.shared.page import table, write_section
-from scripts.shared.records import kept
+from scripts.shared.page import table
+from scripts.shared.sections import NOT_KEPT, Kept, section
 from scripts.shared.skyline_trials import (
     HERE,
     Ground,
@@ -43,7 +35,6 @@ from scripts.shared.skyline_trials import (
 from scripts.shared.traced import capture
 
 Floats = NDArray[np.float64]
-TRIALS = Path(os.environ.get("KCAL_TRIALS", "."))
 NATIONAL = RasterError(sigma=1.0, correlation=150.0, offset=0.5)
 GROUNDS = {
     "20 m cells, 1 m RMS": Ground(cell=20.0, error=NATIONAL),
@@ -109,30 +100,25 @@ def rigs(seed: int) -> dict[str, Any]:
         result = solve_rig(RigData(cameras=cameras, names=("left", "right"), positions=places, skyline=source))
     except KcalError as error:
         return dict.fromkeys(CASES, str(error))
-    (left, off_left), (right, off_right) = (_pointing(result, c, sites[c]) for c in (0, 1))
+    (left, off_left), (right, off_right) = (_pointing(result, c, sites[c], numbers[c]) for c in (0, 1))
     return {
         CASES[0]: [*off_left.tolist(), *_sigmas(result, left).tolist()],
         CASES[1]: [*(off_right - off_left).tolist(), *_sigmas(result, right - left).tolist()],
     }
 
 
-_CAMERAS: dict[int, Camera] = {}
-
-
+@functools.cache
 def _calibrated(number: int) -> Camera:
     """A lens calibrated by 30 views of a printed board with corners of 0.1 px."""
-    if number not in _CAMERAS:
-        _CAMERAS[number] = calibrate_camera(capture(lens_of(number), 30, 0.1, number)).camera
-    return _CAMERAS[number]
+    return calibrate_camera(capture(lens_of(number), 30, 0.1, number)).camera
 
 
-def _pointing(result: RigResult, c: int, site: Site) -> tuple[torch.Tensor, Floats]:
+def _pointing(result: RigResult, c: int, site: Site, number: int) -> tuple[torch.Tensor, Floats]:
     """(6, S) and (6,) px: where a camera sees the true directions of three pixels, across and down, less these."""
     problem, state = result._solution.problem, result._solution.state
     posed = problem.posed(state)[c]
     width, height = posed.camera.size
     pixels = torch.tensor([[share * width, 0.45 * height] for share in (0.15, 0.5, 0.85)]).double()
-    number = next(k for k, camera in _CAMERAS.items() if camera is result.data.cameras[c])
     toward = true_directions(site, lens_of(number), pixels)
     turned = _FAR * posed.rotation @ toward.T
     wanted = range(len(posed.parameters))
@@ -149,14 +135,16 @@ def _sigmas(result: RigResult, rows: torch.Tensor) -> Floats:
     return found
 
 
-def told_alone(found: dict[str, list[Any]]) -> list[str]:
-    """The table of `alone`."""
+@section("skyline.md", "alone", seeds=range(1))
+def told_alone(kept: Kept = NOT_KEPT, seeds: range = range(30)) -> Iterator[str]:
+    records = kept.records([("alone", seed) for seed in seeds], lambda _, seed: alone(seed), lambda _: "done")
     heads = [
         "raster", "RMS error of heading / pitch / roll, °", "median σ", "error over σ", "truth in the 95 %",
         "of the heading's variance the raster's", "columns used", "refused", "CPU s",
     ]  # fmt: skip
     rows = []
-    for name, trials in found.items():
+    for name in GROUNDS:
+        trials = [one[name] for one in records if one["key"][0] == "alone"]
         good = np.array([trial for trial in trials if not isinstance(trial, str)])
         error, sigma = good[:, :3], good[:, 3:6]
         ratio = error / sigma
@@ -169,11 +157,13 @@ def told_alone(found: dict[str, list[Any]]) -> list[str]:
     return table(heads, rows)
 
 
-def told_rigs(found: dict[str, list[Any]]) -> list[str]:
-    """The table of `rigs`."""
+@section("skyline.md", "rigs", seeds=range(1))
+def told_rigs(kept: Kept = NOT_KEPT, seeds: range = range(30)) -> Iterator[str]:
+    records = kept.records([("rigs", seed) for seed in seeds], lambda _, seed: rigs(seed), lambda _: "done")
     heads = ["which way", "RMS error across / up, °", "RMS σ", "error over σ", "truth in the 95 %", "refused"]
     degree, rows = math.degrees(1.0 / FOCAL), []
-    for name, trials in found.items():
+    for name in CASES:
+        trials = [one[name] for one in records if one["key"][0] == "rigs"]
         good = np.array([trial for trial in trials if not isinstance(trial, str)]).reshape(-1, 2, 2, 3)
         error, sigma = good[:, 0].transpose(1, 0, 2).reshape(2, -1), good[:, 1].transpose(1, 0, 2).reshape(2, -1)
         ratio = error / sigma
@@ -187,24 +177,3 @@ def told_rigs(found: dict[str, list[Any]]) -> list[str]:
 
 def _three(values: Floats, digits: int) -> str:
     return " / ".join(f"{value:.{digits}f}" for value in values)
-
-
-WHAT: dict[
-    str, tuple[Callable[[int], dict[str, Any]], tuple[str, ...], Callable[[dict[str, list[Any]]], list[str]]]
-] = {
-    "alone": (alone, tuple(GROUNDS), told_alone),
-    "rigs": (rigs, CASES, told_rigs),
-}
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=WHAT)
-    parser.add_argument("count", type=int, help="draws of each kind")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/measured/skyline.md")
-    options = parser.parse_args()
-    run, names, told = WHAT[options.what]
-    lines = told(kept(TRIALS / f"skyline-{options.what}.jsonl", list(names), range(options.count), run))
-    print("\n".join(lines))
-    if options.write:
-        made = f"Made by `python -m scripts.check.skyline {options.what} {options.count} --write`."
-        write_section("skyline.md", options.what, [*lines, "", made])

@@ -1,20 +1,19 @@
 """Stars: real images, identification of random points, and simulated rigs, as `docs/howto/stars.md` states them.
 
-    python -m scripts.check.stars real --write
-    python -m scripts.check.stars random 10000
-    python -m scripts.check.stars rigs 30
-    python -m scripts.check.stars lens 3
-
-Real images are those of `KCAL_DATA/stars` (six of one camera; esa/tetra3). `real` compares with cedar-solve or tetra3
-where one of them is installed.
+Real images are those of `KCAL_DATA/stars` (six of one camera; esa/tetra3), compared with cedar-solve or tetra3 where
+one of them is installed. *rigs*: draws of noise, survey, tape (± 2 mm), clock (± 20 ms) and air (± 3 K), over 8 pairs
+of traced surveillance lenses (f 1600 px, level, 10 m apart), each calibrated by 30 views of a printed board; stars of
+0.1 px to magnitude 6 (1 pair) and 5 (20 pairs over 8 h), matches of unknown range of 0.1 px; targets in 9 bearings
+along the horizon. σ and errors are of the rig alone, with exact marks. *lens*: traced lenses with errors of assembly
+(webcam, machine vision, surveillance in turn), each calibrated by 20 views of a printed board (corners of 0.1 px), by
+20 night images over 8 h (stars to magnitude 5 of 0.1 px), and by both.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,34 +25,19 @@ from kcal.stars.detect import detect_stars, read_night, time_of
 from kcal.stars.lens import StarCamera, calibrate_by_stars
 from kcal.stars.night import SkyView, fit_attitude, name_stars
 from kcal.stars.sky import StarCatalog, identify
-from scripts.shared.page import write_section
-from scripts.shared.records import kept
+from scripts.shared.page import table
+from scripts.shared.real_captures import data_folder
+from scripts.shared.sections import NOT_KEPT, Kept, section
+from scripts.shared.timing import rms
 
-# Trials that are done already, one a line; a run continues where another one ended.
-RIGS, LENSES = (Path(os.environ.get("KCAL_TRIALS", "."), f"stars-{what}.jsonl") for what in ("rigs", "lens"))
 DELFT = Origin(lat=52.0, lon=4.37, height=0.0)
-_said: list[str] = []
-_ABOUT = {
-    "rigs": ": {count} draws of noise, survey, tape (± 2 mm), clock (± 20 ms) and air (± 3 K), over 8 pairs of traced "
-    "surveillance lenses (f 1600 px, level, 10 m apart), each calibrated by 30 views of a printed board; stars of "
-    "0.1 px to magnitude 6 (1 pair) and 5 (20 pairs over 8 h), matches of unknown range of 0.1 px; targets in 9 "
-    "bearings along the horizon. σ and errors are of the rig alone, with exact marks",
-    "lens": ": traced lenses with errors of assembly (webcam, machine vision, surveillance in turn), each calibrated "
-    "by 20 views of a printed board (corners of 0.1 px), by 20 night images over 8 h (stars to magnitude 5 of 0.1 px), "
-    "and by both",
-}
 SIZES = {(1600.0, (1920, 1080)), (5110.0, (1024, 768)), (900.0, (1280, 800))}
 
 
-def say(text: str, flush: bool = True) -> None:
-    """Print a line of the page."""
-    print(text, flush=flush)
-    _said.append(text)
-
-
-def real() -> None:
+@section("stars.md", "real")
+def real() -> Iterator[str]:
     """Six real images: names, times, one lens, residuals by magnitude, and each image predicted by the others."""
-    files = sorted(Path(os.environ["KCAL_DATA"], "stars").glob("*.png"))
+    files = sorted((data_folder() / "stars").glob("*.png"))
     views = [SkyView(time=time_of("name:Z", path), origin=DELFT) for path in files]
     images, seconds = [], []
     for path in files:
@@ -66,41 +50,42 @@ def real() -> None:
     whole = calibrate_by_stars(images, views, size)
     spent_on_lens, lens = time.process_time() - begin, whole.lens
     theirs = peer(files)
-    say("| image | stars | named | RMS px | detect and name, CPU s | cedar-solve: stars | its RMSE | CPU s |\n"
-        "|---|---|---|---|---|---|---|---|")  # fmt: skip
+    rows, said = [], []
     for path, view in zip(files, views, strict=True):
         image = read_night(path)
         begin = time.process_time()
         found = name_stars(image, lens.camera, view)
         spent = time.process_time() - begin
         stars = found.attitude
-        told = theirs.get(path, "not installed | |")
+        told = theirs.get(path, ["not installed", "", ""])
         name = path.stem.split("_", 1)[-1]
-        say(f"| {name} | {len(found.detected.pixels)} | {stars.count} | {stars.rms_px:.3f} | {spent:.2f} | {told} |")
-        for text in found.warnings:
-            say(f"\n{path.stem}: {text}\n")
-    say("\n| magnitude | stars | RMS along an axis, px |\n|---|---|---|")
-    by_magnitude(whole)
-    say("")
-    say(f"detection {np.mean(seconds):.2f} CPU s an image; lens and names {spent_on_lens:.0f}")
-    say(f"{len(whole.images)} of {len(files)} images, {sum(int(u.sum()) for u in lens.used)} stars, "
-          f"{sum(int((~u).sum()) for u in lens.used)} left out, RMS along an axis {lens.rms_px:.4f} px, "
-          f"{lens.effective:.1f} effective unknowns, f {float(lens.camera.params[0]):.2f} px")  # fmt: skip
-    held_out(images, views, size, float(lens.camera.params[0]))
+        rows.append([name, len(found.detected.pixels), stars.count, f"{stars.rms_px:.3f}", f"{spent:.2f}", *told])
+        said += [f"{path.stem}: {text}" for text in found.warnings]
+    heads = ["image", "stars", "named", "RMS px", "detect and name, CPU s", "cedar-solve: stars", "its RMSE", "CPU s"]
+    yield from table(heads, rows)
+    yield from ["", *said, ""]
+    yield from table(["magnitude", "stars", "RMS along an axis, px"], by_magnitude(whole))
+    yield from ["", f"detection {np.mean(seconds):.2f} CPU s an image; lens and names {spent_on_lens:.0f}"]
+    focal = float(lens.camera.params[0])
+    yield (
+        f"{len(whole.images)} of {len(files)} images, {sum(int(u.sum()) for u in lens.used)} stars, "
+        f"{sum(int((~u).sum()) for u in lens.used)} left out, RMS along an axis {lens.rms_px:.4f} px, "
+        f"{lens.effective:.1f} effective unknowns, f {focal:.2f} px"
+    )
+    yield held_out(images, views, size, focal)
 
 
-def by_magnitude(whole: StarCamera) -> None:
+def by_magnitude(whole: StarCamera) -> Iterator[list[str]]:
     """RMS residual of the stars of each magnitude."""
     magnitude = np.concatenate([StarCatalog.bundled().magnitude[star] for star in whole.stars])
     error = torch.cat(whole.lens.residuals).numpy()
     for low, high in ((-2, 4), (4, 5), (5, 6), (6, 8)):
         some = (magnitude >= low) & (magnitude < high)
         if some.any():
-            rms = np.sqrt((error[some] ** 2).mean())
-            say(f"| {low} to {high} | {some.sum()} | {rms:.3f} |")
+            yield [f"{low} to {high}", f"{some.sum()}", f"{rms(error[some]):.3f}"]
 
 
-def held_out(images: list, views: list, size: tuple[int, int], focal: float) -> None:
+def held_out(images: list, views: list, size: tuple[int, int], focal: float) -> str:
     """One lens of five images predicts the sixth: its attitude by every other star, residuals of the others."""
     catalog, errors = StarCatalog.bundled(), []
     for out in range(len(images)):
@@ -120,12 +105,14 @@ def held_out(images: list, views: list, size: tuple[int, int], focal: float) -> 
             at, _ = camera.project(1e9 * torch.from_numpy(directions[named.attitude.star[theirs]]) @ best.rotation.T)
             errors.append(at.numpy() - images[out].pixels[theirs])
     error = np.concatenate(errors)
-    rms = np.sqrt((error**2).mean())
-    say(f"held out: {len(error)} stars of {len(images)} images, RMS along an axis {rms:.3f} px, "
-          f"median distance {np.median(np.linalg.norm(error, axis=1)):.3f} px")  # fmt: skip
+    middle = np.median(np.linalg.norm(error, axis=1))
+    return (
+        f"held out: {len(error)} stars of {len(images)} images, RMS along an axis {rms(error):.3f} px, median distance "
+        f"{middle:.3f} px"
+    )
 
 
-def peer(files: list[Path]) -> dict[Path, str]:
+def peer(files: list[Path]) -> dict[Path, list[str]]:
     """Cells of the table: cedar-solve or tetra3 on the same images; nothing where neither is installed."""
     try:
         import tetra3  # type: ignore[import-not-found, unused-ignore]
@@ -140,11 +127,12 @@ def peer(files: list[Path]) -> dict[Path, str]:
         found = solver.solve_from_image(Image.open(path), fov_estimate=11.4, fov_max_error=1.0)
         spent = time.process_time() - begin
         rmse = found.get("RMSE")
-        told[path] = f"{found.get('Matches')} | {'' if rmse is None else f'{rmse:.1f}″'} | {spent:.2f}"
+        told[path] = [str(found.get("Matches")), "" if rmse is None else f"{rmse:.1f}″", f"{spent:.2f}"]
     return told
 
 
-def random_points(count: int) -> None:
+@section("stars.md", "random", count=2)
+def random_points(count: int = 10_000) -> Iterator[str]:
     """False names of random points: of 4 to 20 points each, seen by three cameras in turn."""
     generator, wrong, begin = np.random.default_rng(34), 0, time.process_time()
     cameras = sorted(SIZES)
@@ -155,63 +143,49 @@ def random_points(count: int) -> None:
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         field = 2 * math.atan(math.hypot(*size) / 2 / focal)
         wrong += identify(rays, 2.5 / focal, field=field) is not None
-        if (number + 1) % 500 == 0:
-            print(number + 1, wrong, flush=True)
     spent = (time.process_time() - begin) / count
-    say(f"{count} fields of 4 to 20 random points: {wrong} with names; {spent:.2f} CPU s each")
+    yield f"{count} fields of 4 to 20 random points: {wrong} with names; {spent:.2f} CPU s each"
 
 
-def rigs(count: int) -> None:
-    """Ranges of rigs behind traced lenses that boards calibrated: errors, and coverage of their 95 % intervals."""
+def rig_trial(_: str, seed: int) -> dict[str, Any]:
     from scripts.shared.traced_nights import CASES, PAIRS_OF_LENSES, trial
 
-    def run(seed: int) -> dict[str, Any]:
-        return {case.name: trial(200 + seed % PAIRS_OF_LENSES, case, seed).tolist() for case in CASES}
-
-    found = kept(RIGS, [case.name for case in CASES], range(count), run)
-    say("| rig from a taped baseline and | σ, % of range at 1, 2, 5 km | RMS error | error over σ | truth in the rig's "
-        "95 % | with marks by day ± 0.1 px |\n|---|---|---|---|---|---|")  # fmt: skip
-    for name, trials in found.items():
-        mean = np.mean(trials, axis=0)
-        cells = [
-            " / ".join(f"{factor * value:.{digits}f}" for value in values)
-            for values, factor, digits in (
-                (np.sqrt(mean[:, 0]), 100, 2), (np.sqrt(mean[:, 1]), 100, 2), (np.sqrt(mean[:, 1] / mean[:, 0]), 1, 2),
-                (mean[:, 2], 100, 0), (mean[:, 3], 100, 0),
-            )
-        ]  # fmt: skip
-        say(f"| {name} | {' | '.join(cells)} |")
+    return {case.name: trial(200 + seed % PAIRS_OF_LENSES, case, seed).tolist() for case in CASES}
 
 
-def lens(count: int) -> None:
+@section("stars.md", "rigs", seeds=range(1))
+def rigs(kept: Kept = NOT_KEPT, seeds: range = range(30)) -> Iterator[str]:
+    """Ranges of rigs behind traced lenses that boards calibrated: errors, and coverage of their 95 % intervals."""
+    records = kept.records([("rig", seed) for seed in seeds], rig_trial, lambda _: "done")
+    rows = []
+    for name in [name for name in records[0] if name != "key"]:
+        mean = np.mean([one[name] for one in records if name in one], axis=0)
+        parts = (
+            (np.sqrt(mean[:, 0]), 100, 2), (np.sqrt(mean[:, 1]), 100, 2), (np.sqrt(mean[:, 1] / mean[:, 0]), 1, 2),
+            (mean[:, 2], 100, 0), (mean[:, 3], 100, 0),
+        )  # fmt: skip
+        cells = [" / ".join(f"{factor * v:.{digits}f}" for v in values) for values, factor, digits in parts]
+        rows.append([name, *cells])
+    heads = ["rig from a taped baseline and", "σ, % of range at 1, 2, 5 km", "RMS error", "error over σ"]
+    return table([*heads, "truth in the rig's 95 %", "with marks by day ± 0.1 px"], rows)
+
+
+def lens_trial(_: str, seed: int) -> dict[str, Any]:
+    from scripts.shared.star_lenses import lens_trials
+
+    return {name: list(trial) for name, trial in lens_trials(seed).items()}
+
+
+@section("stars.md", "lens", seeds=range(1))
+def lens(kept: Kept = NOT_KEPT, seeds: range = range(6)) -> Iterator[str]:
     """A lens from boards, stars, and both, against the traced one at infinity; level and tilted by 30°."""
-    from scripts.shared.star_lenses import LENSES_FROM, lens_trials
-
-    def run(seed: int) -> dict[str, Any]:
-        return {name: list(trial) for name, trial in lens_trials(seed).items()}
-
-    found = kept(LENSES, LENSES_FROM, range(count), run)
-    say("| from | error at infinity, px: median of the RMS | largest RMS | largest anywhere | inside 95 % "
-        "| χ² of boards against stars, over its freedom | contradictions |\n|---|---|---|---|---|---|---|")  # fmt: skip
-    for name, trials in found.items():
-        rms, largest, inside, chi2, contradiction = (np.array(column) for column in zip(*trials, strict=True))
-        told = f"{chi2.mean():.2f} | {contradiction.sum()}" if np.isfinite(chi2).all() else "|"
-        say(f"| {name} | {np.median(rms):.4f} | {rms.max():.4f} | {largest.max():.3f} | {100 * inside.mean():.1f} % "
-            f"| {told} |")  # fmt: skip
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("real", "random", "rigs", "lens"))
-    parser.add_argument("count", type=int, nargs="?", default=30, help="points, rigs or lenses; real images are six")
-    parser.add_argument("--write", action="store_true", help="put the result into docs/measured/stars.md")
-    options = parser.parse_args()
-    what, count = options.what, options.count
-    if what == "real":
-        real()
-    else:
-        {"random": random_points, "rigs": rigs, "lens": lens}[what](count)
-    if options.write:
-        words = f"{what} --write" if what == "real" else f"{what} {count} --write"
-        made = f"Made by `python -m scripts.check.stars {words}`{_ABOUT.get(what, '').format(count=count)}."
-        write_section("stars.md", what, made + "\n\n" + "\n".join(_said))
+    records = kept.records([("lens", seed) for seed in seeds], lens_trial, lambda _: "done")
+    rows = []
+    for name in [name for name in records[0] if name != "key"]:
+        trials = [one[name] for one in records if name in one]
+        error, largest, inside, chi2, contradiction = (np.array(column) for column in zip(*trials, strict=True))
+        told = [f"{chi2.mean():.2f}", contradiction.sum()] if np.isfinite(chi2).all() else ["", ""]
+        shown = [f"{np.median(error):.4f}", f"{error.max():.4f}", f"{largest.max():.3f}"]
+        rows.append([name, *shown, f"{100 * inside.mean():.1f} %", *told])
+    heads = ["from", "error at infinity, px: median of the RMS", "largest RMS", "largest anywhere", "inside 95 %"]
+    return table([*heads, "χ² of boards against stars, over its freedom", "contradictions"], rows)

@@ -1,8 +1,5 @@
 """Tracks over stations: five of them 11 to 60 km apart on the round Earth, smokes, ships and drones, unlike clocks.
 
-    python -m scripts.check.station_tracks --seeds 24 --seconds 60 --write
-    python -m scripts.check.station_tracks --speed --write    # 100 and 1,000 targets in 8 cameras: grouping, tracks
-
 Each seed draws position, attitude and refraction errors, clocks (offset and rate) and targets anew, from what is
 stated. Marks are rendered in each station's own east, north, up (`scripts/shared/station_scenes.py`), not as kcal
 computes them. A camera misses a target in view with probability 0.15, and has one false detection an image. Halfway,
@@ -15,8 +12,9 @@ inside: 95 % ellipsoids (chi-squared, 3) of tracks with a position, every tenth 
 
 from __future__ import annotations
 
-import argparse
+import itertools
 import time
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +25,8 @@ from kcal import Camera, Localizer, Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
 from kcal.pipeline.pairing import ObjectViews
 from kcal.track import AssociationOptions, ClockPrior, Detections, Motion, Tracker, TrackOptions, group_objects
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.sections import section
 from scripts.shared.station_scenes import ORIGIN, drawn_errors, marks, ring
 
 BOX_PX, MISSED, FALSE = 1.0, 0.15, 1.0
@@ -199,7 +198,18 @@ def _judge_groups(views: ObjectViews, seen: list[Detections | None], owners: lis
         sums.right += len(found) == 1 and -1 not in found
 
 
-def report(counts: list[int], all_sums: list[Sums], seeds: int, seconds: float) -> str:
+@section("tracks.md", "station tracks", seeds=1, seconds=12.0, counts=(2,))
+def station_tracks(seeds: int = 8, seconds: float = 60.0, counts: tuple[int, ...] = (2, 3, 5)) -> Iterator[str]:
+    yield (
+        "12 targets (smokes, ships at 8 m/s, drones at 25 m/s) in 12 by 16 km, all of one category, once a second for "
+        f"{seconds:g} s, {seeds} draws; boxes {BOX_PX:g} px, {100 * MISSED:g} % missed, {FALSE:g} false an image; "
+        f"attitude known to {ATTITUDE_DEG[0]}° and heading to {ATTITUDE_DEG[2]}°, clocks to {OFFSET_S} s and "
+        f"{1e6 * RATE:g} ppm."
+    )
+    yield ""
+    all_sums = [Sums() for _ in counts]
+    for seed, (count, each) in itertools.product(range(seeds), zip(counts, all_sums, strict=True)):
+        run_seed(seed, count, seconds, each)
     rows = []
     for count, s in zip(counts, all_sums, strict=True):
         nees, clocks = np.array(s.nees), np.array(s.clocks).reshape(-1, 2)
@@ -223,14 +233,7 @@ def report(counts: list[int], all_sums: list[Sums], seeds: int, seconds: float) 
         "ghosts among tracks",
         "inside 95 %; median of χ² over its own", "clock at the end: RMS, inside 95 %", "CPU a moment",
     ]  # fmt: skip
-    return "\n".join([
-        "12 targets (smokes, ships at 8 m/s, drones at 25 m/s) in 12 by 16 km, all of one category, once a second for "
-        f"{seconds:g} s, {seeds} draws; boxes {BOX_PX:g} px, {100 * MISSED:g} % missed, {FALSE:g} false an image; "
-        f"attitude known to {ATTITUDE_DEG[0]}° and heading to {ATTITUDE_DEG[2]}°, clocks to {OFFSET_S} s and "
-        f"{1e6 * RATE:g} ppm. Made by `python -m scripts.check.station_tracks --write`.",
-        "",
-        *table(heads, rows),
-    ])  # fmt: skip
+    yield from table(heads, rows)
 
 
 def crowd(targets: int, missed: float, false: int, seed: int) -> list[str]:
@@ -276,45 +279,18 @@ def crowd(targets: int, missed: float, false: int, seed: int) -> list[str]:
     ]  # fmt: skip
 
 
-def speed(targets: list[int]) -> str:
+@section("tracks.md", "station speed", targets=(10,))
+def speed(targets: tuple[int, ...] = (100, 1000)) -> Iterator[str]:
     """Targets in 8 cameras: CPU of grouping and of tracking them, and how many groups are right."""
+    yield (
+        "Targets in 5 by 5 km, .8 km high, 8 cameras around them in 8 km; one thread, one draw of the cameras' "
+        "errors. A group is right if all its marks are of one thing."
+    )
+    yield ""
     crowd(20, 0.0, 0, 0)
     rows = [crowd(count, *rest, 0) for count in targets for rest in ((0.0, 0), (0.15, 0), (0.15, count // 30))]
     heads = [
         "targets", "marks of them in 8 cameras", "CPU of grouping", "right groups", "wrong groups", "doubtful groups",
         "marks in groups that are not doubtful", "CPU of the tracker",
     ]  # fmt: skip
-    return "\n".join([
-        "Targets in 5 by 5 km, .8 km high, 8 cameras around them in 8 km; one thread, one draw of the cameras' "
-        "errors. A group is right if all its marks are of one thing. Made by "
-        "`python -m scripts.check.station_tracks --speed --write`.",
-        "",
-        *table(heads, rows),
-    ])  # fmt: skip
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=8)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--counts", type=int, nargs="+", default=[2, 3, 5])
-    parser.add_argument("--speed", action="store_true")
-    parser.add_argument("--targets", type=int, nargs="+", default=[100, 1000], help="of --speed")
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    if options.speed:
-        text = speed(options.targets)
-        print(text)
-    else:
-        sums = [Sums() for _ in options.counts]
-        for seed in range(options.seeds):
-            for count, each in zip(options.counts, sums, strict=True):
-                run_seed(seed, count, options.seconds, each)
-            text = report(options.counts, sums, seed + 1, options.seconds)
-            print(f"after {seed + 1} seeds\n{text}", flush=True)
-    write_section("tracks.md", "station speed" if options.speed else "station tracks", text, write=options.write)
-
-
-if __name__ == "__main__":
-    main()
+    yield from table(heads, rows)

@@ -1,11 +1,5 @@
 """Stations: triangulation beside other programs, coverage of the ellipses, crossing bearings, a real capture.
 
-    python -m scripts.check.stations peers [POINTS]    # error and CPU time; --write puts any part into the page
-    python -m scripts.check.stations coverage [DRAWS]
-    python -m scripts.check.stations smoke [DRAWS]
-    python -m scripts.check.stations real              # KCAL_DATA/stations/pose2sim.npz
-    python -m scripts.check.stations picture           # docs/howto/stations.png
-
 Other programs are used where they import: `pip install --no-deps aniposelib numba llvmlite jax jaxlib ml_dtypes
 opt_einsum pose2sim rtoml c3d anytree` into a folder on PYTHONPATH. OpenCV and kornia triangulate two views; `cv2.sfm`
 is in no wheel.
@@ -26,11 +20,9 @@ standard deviations.
 from __future__ import annotations
 
 import math
-import os
 import time
 import warnings
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -39,8 +31,9 @@ from torch import Tensor
 from kcal import Camera, Localizer, Rig
 from kcal.locate import Triangulate
 from kcal.locate.stereo import Localization, PositionStatus
-from scripts.shared.page import table
-from scripts.shared.sections import run, section
+from scripts.shared.page import DOCS, table
+from scripts.shared.real_captures import data_folder
+from scripts.shared.sections import section
 from scripts.shared.station_scenes import drawn_errors, marks, ring, targets
 from scripts.shared.timing import show
 
@@ -152,18 +145,20 @@ def peers_of(rig: Rig) -> dict[str, tuple[Solve, int]]:
     return found
 
 
-def compare(count: int, points: int) -> list[str]:
+@section("stations.md", "peers", count=200)
+@torch.no_grad()
+def peers(count: int = 20_000) -> Iterator[str]:
     """Table of errors and times."""
     rows = []
     for views, missing, wrong in (
         (2, 0.0, 0.0), (4, 0.0, 0.0), (8, 0.0, 0.0), (4, 0.1, 0.05), (8, 0.0, 0.05), (8, 0.1, 0.05), (8, 0.4, 0.05),
     ):  # fmt: skip
-        rig, generator = around_a_person(views), torch.Generator().manual_seed(count)
-        cloud = torch.randn(points, 3, generator=generator, dtype=torch.float64) * 0.3 + torch.tensor([0.0, 0, 1.0])
+        rig, generator = around_a_person(views), torch.Generator().manual_seed(1)
+        cloud = torch.randn(count, 3, generator=generator, dtype=torch.float64) * 0.3 + torch.tensor([0.0, 0, 1.0])
         exact, _ = rig(cloud)
         pixels = spoiled(exact, missing, wrong, generator).numpy()
         for name, (solve, fewer) in peers_of(rig).items():
-            some = pixels[: max(points // fewer, 100)]
+            some = pixels[: max(count // fewer, 100)]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 # Compilers work once for each size.
@@ -178,12 +173,13 @@ def compare(count: int, points: int) -> list[str]:
                 [views, f"{missing:.0%}", f"{wrong:.0%}", name, f"{middle:.2f}", f"{high:.2f}", f"{none.mean():.1%}",
                  f"{seconds:.1f}"]
             )  # fmt: skip
-            show([str(rows[-1])])
     heads = ["views", "missing", "wrong", "program", "median mm", "95 % mm", "no position", "CPU s per million"]
     return table(heads, rows)
 
 
-def coverage(draws: int) -> list[str]:
+@section("stations.md", "coverage", draws=200)
+@torch.no_grad()
+def coverage(draws: int = 20_000) -> Iterator[str]:
     """Table of shares inside the 95 % ellipsoids."""
     rows = []
     for kilometers in (1, 5, 20):
@@ -203,7 +199,6 @@ def coverage(draws: int) -> list[str]:
             sigma = found.covariance[ok].diagonal(dim1=-2, dim2=-1)[:, :2].sum(-1).sqrt().median()
             cells.append(f"{(squares < _CHI2_95).double().mean():.1%} ({float(sigma):.2g} m)")
         rows.append(cells)
-        show([str(cells)])
     return table(["distance", *(f"V = {views}" for views in range(2, 9))], rows)
 
 
@@ -226,7 +221,9 @@ def area(polygon: np.ndarray) -> float:
     return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
 
 
-def smoke(draws: int) -> list[str]:
+@section("stations.md", "smoke", draws=20)
+@torch.no_grad()
+def smoke(draws: int = 2000) -> Iterator[str]:
     """Table of crossing bearings."""
     rows = []
     width, edge, shift, heading = 200.0, 5.0, 0.2, 0.2
@@ -277,7 +274,6 @@ def smoke(draws: int) -> list[str]:
              f"{(~ok).double().mean():.0%}", f"{areas.median() / 1e6:.3f}",
              f"{float(error[ok].norm(dim=-1).median()):.0f}"]
         )  # fmt: skip
-        show([str(rows[-1])])
     heads = [
         "distance", "cones contain it", "cones do not meet", "their area km²", "95 % ellipses contain it",
         "no position", "their area km²", "median error m",
@@ -291,9 +287,11 @@ def _contains(polygon: np.ndarray, point: np.ndarray) -> bool:
     return bool((cross >= 0).all() or (cross <= 0).all())
 
 
+@section("stations.md", "real")
+@torch.no_grad()
 def real() -> list[str]:
     """Table for the four cameras and the walking person: two cameras' points seen by the others."""
-    data = np.load(Path(os.environ["KCAL_DATA"]) / "stations" / "pose2sim.npz")
+    data = np.load(data_folder() / "stations" / "pose2sim.npz")
     cameras = []
     for matrix, bends in zip(data["K"], data["D"], strict=True):
         cameras.append(
@@ -333,7 +331,8 @@ def real() -> list[str]:
     return [note, "", *table(heads, rows)]
 
 
-def picture() -> None:
+@section("stations.md", "picture")
+def picture(write: bool = False) -> None:
     """Towers and smoke, for the how-to page."""
     from kcal.locate.marks import Marks
     from kcal.locate.points import locate_points
@@ -356,36 +355,5 @@ def picture() -> None:
     seen[2, 1], seen[3, :2] = math.nan, math.nan
     views = Marks(("smoke 1", "smoke 2", "smoke 3", "smoke 4"), seen, sigma=torch.full((4, 3), 10.0).double())
     located = locate_points(rig, views)
-    path = Path(__file__).parents[2] / "docs" / "howto" / "stations.png"
-    show([str(save_picture(path, stations_figure(located, points)))])
-
-
-@section("stations.md", "peers", count=200)
-def peers(count: int = 20_000) -> list[str]:
-    with torch.no_grad():
-        return compare(1, count)
-
-
-@section("stations.md", "coverage", count=200)
-def covered(count: int = 20_000) -> list[str]:
-    with torch.no_grad():
-        return coverage(count)
-
-
-@section("stations.md", "smoke", fires=20)
-def smokes(fires: int = 2000) -> list[str]:
-    with torch.no_grad():
-        return smoke(fires)
-
-
-section("stations.md", "real")(torch.no_grad()(real))
-
-
-@section("stations.md", "picture")
-def drawn(write: bool = False) -> None:
     if write:
-        picture()
-
-
-if __name__ == "__main__":
-    run()
+        save_picture(DOCS.parent / "howto" / "stations.png", stations_figure(located, points))

@@ -1,16 +1,14 @@
 """Tracks of a simulated site: 30 targets from 100 m to 5 km, cameras of 10 and 25 frames a second, 40 ms apart.
 
-    python -m scripts.check.tracks --seeds 8 --seconds 12 --write
-
 Each seed draws the rig's true yaw, the targets and the noise anew. Single frames, filter, smoother and Stone Soup's
 filter (the package `stonesoup`) get the same pairs.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +22,9 @@ from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 from kcal.rig import RigCovariance, planned_rig
 from kcal.track import ClockPrior, Motion
 from scripts.check.track_rivals import CartesianFilters, OfPixels, OfPositions
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.sections import section
+from scripts.shared.timing import rms
 
 # Degrees: the relative yaw is known to this, 44 m at 5 km.
 YAW_SIGMA = 0.001
@@ -149,7 +149,7 @@ def relative(state: Any, true: Tensor) -> Tensor:
     return (state.inverse_range - 1.0 / torch.linalg.vector_norm(true, dim=-1)) / state.inverse_range_sigma
 
 
-def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> None:
+def run_seed(seed: int, seconds: float, figures: Figures) -> None:
     frames = round(seconds * 10)
     site = drawn_site(seed, frames)
     options = TrackOptions(motions=(Motion(acceleration=ACCELERATION),), speed_mps=15.0)
@@ -168,10 +168,9 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
         tracks, exact = tracker(pairs), informed(pairs)
         one = site.localize(pairs.left, pairs.right, pairs.covariance)
         mine = owner(tracks, site, places)
-        if oracle:
-            same = equal(pairs)
-            pixels.take(which, pairs, plain(pairs.left, pairs.right, pairs.covariance).enu, plain, OFFSET)
-        if oracle and frame >= 5:
+        same = equal(pairs)
+        pixels.take(which, pairs, plain(pairs.left, pairs.right, pairs.covariance).enu, plain, OFFSET)
+        if frame >= 5:
             # This one is even told the velocities that bring the two times of a pair together.
             late = (pairs.time[:, 1:] - pairs.time[:, :1] + OFFSET) * pace[which, :1] / float(site.true.baseline)
             ahead = one.enu * (1.0 - late)
@@ -196,7 +195,7 @@ def run_seed(seed: int, seconds: float, figures: Figures, *, oracle: bool) -> No
             figures.add("position", error / sigma)
             floor = tracks.state.covariance[ok] - tracks.state.systematic[ok]
             figures.add("floor", torch.linalg.eigvalsh(floor)[:, 0] / floor.diagonal(dim1=-2, dim2=-1).sum(-1))
-            if oracle and frame >= 30:
+            if frame >= 30:
                 compare(figures, "positions", positions, exact, owner(exact, site, places), enu, time)
                 compare(figures, "pixels", pixels, same, owner(same, site, places), enu, time)
     offset, doubt = tracker.clock_estimate().offset(seconds / 2)
@@ -246,35 +245,19 @@ def compare(
     figures.add(f"{kind}: followed", float(len(names)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=4)
-    parser.add_argument("--seconds", type=float, default=12.0)
-    parser.add_argument("--clock-seconds", type=float, default=60.0, help="of the runs of the clock; 0: none")
-    parser.add_argument("--clock-seeds", type=int, default=4)
-    parser.add_argument("--without-stonesoup", action="store_true")
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+@section("tracks.md", "tracks", seeds=1, seconds=4.0, clock_seeds=1, clock_seconds=3.0)
+def tracks(seeds: int = 4, seconds: float = 12.0, clock_seeds: int = 4, clock_seconds: float = 60.0) -> Iterator[str]:
+    """Seeds and seconds of the tracks, and of the runs of the clock."""
     figures = Figures()
-    for seed in range(options.seeds):
-        run_seed(seed, options.seconds, figures, oracle=not options.without_stonesoup)
-        text = report(figures, seed + 1, options.seconds)
-        print(f"after {seed + 1} seeds\n{text}", flush=True)
-    for seed in range(options.clock_seeds if options.clock_seconds else 0):
-        run_clock(100 + seed, options.clock_seconds, figures)
-        print(f"clock, after {seed + 1} seeds\n{clock_report(figures, options.clock_seconds)}", flush=True)
-    if options.clock_seconds and options.clock_seeds:
-        text += "\n\n" + clock_report(figures, options.clock_seconds)
-    write_section("tracks.md", "tracks", text, write=options.write)
-
-
-def report(figures: Figures, seeds: int, seconds: float) -> str:
+    for seed in range(seeds):
+        run_seed(seed, seconds, figures)
+    for seed in range(clock_seeds):
+        run_clock(100 + seed, clock_seconds, figures)
     meters = 5000.0**2
-    rows: list[list[object]] = [["single frame", f"{_rms(figures.all('single')) * meters:,.0f} m", ""]]
+    rows: list[list[object]] = [["single frame", f"{rms(figures.all('single')) * meters:,.0f} m", ""]]
     for name in ("1 s", "10 s"):
         if f"range {name}" in figures.errors:
-            error, bound = _rms(figures.all(f"range {name}")), _rms(figures.all(f"bound {name}"))
+            error, bound = rms(figures.all(f"range {name}")), rms(figures.all(f"bound {name}"))
             rows.append([f"after {name}", f"{error * meters:,.0f} m", f"{error / bound:.2f}"])
     outputs = [
         [name, f"{100 * float((figures.all(key).abs() < 1.96).double().mean()):.1f} %", len(figures.all(key))]
@@ -283,55 +266,49 @@ def report(figures: Figures, seeds: int, seconds: float) -> str:
     ]  # fmt: skip
     offset = figures.all("clock ms")
     # Of a target at 30 m/s that crosses at 5 km: range times speed over baseline.
-    lost = [5000.0 * 30.0 / 10.0 * ms / 1e3 for ms in (40.0, _rms(offset))]
-    lines = [
+    lost = [5000.0 * 30.0 / 10.0 * ms / 1e3 for ms in (40.0, rms(offset))]
+    yield (
         f"{TARGETS} targets from 100 m to 5 km, six of them at 5 km and 30 m/s; cameras of 10 and 25 frames a second; "
         f"boxes {BEARING_PX} px, matching {MATCH_PX} px; relative yaw known to {YAW_SIGMA}°; {seconds:g} s, {seeds} "
-        "draws of rig, targets and noise. Made by `python -m scripts.check.tracks --write`.",
-        "",
-        *table(
-            ["range at 5 km", "RMS of error (of the inverse range, times 5 km squared)", "over its stated sigma"], rows
-        ),
-        "",
-        *table(["output", "in the 95 % interval", "cases"], outputs),
-        "",
-        f"Smallest eigenvalue of covariance minus systematic part, over its trace: "
-        f"{float(figures.all('floor').min()):.1e}.",
-        "",
-        f"Clock: offset of {1e3 * OFFSET:g} ms found with an RMS error of {_rms(offset):.2f} ms, stated "
-        f"{_rms(figures.all('clock sigma ms')):.2f} ms. A target at 30 m/s that crosses at 5 km is wrong by "
-        f"{lost[0]:.0f} m without and {lost[1]:.0f} m with it.",
-    ]
-    if "pixels: kcal" in figures.numbers:
-        mean = {name: float(np.mean(values)) for name, values in figures.numbers.items()}
-        missed, doubled, followed = (
-            sum(figures.numbers[f"pixels: {name}"]) for name in ("missed", "doubled", "followed")
-        )
-        lines += [
-            "",
-            *table(
-                ["GOSPA (cutoff 300 m) of the targets that both follow", "kcal", "Stone Soup", "kcal over Stone Soup"],
-                [
-                    [
-                        what,
-                        f"{mean[f'{kind}: kcal']:.1f} m",
-                        f"{mean[f'{kind}: stonesoup']:.1f} m",
-                        f"{mean[f'{kind}: kcal'] / mean[f'{kind}: stonesoup']:.3f}",
-                    ]
-                    for what, kind in (
-                        ("equal information: the pairs, the true rig, the clock; unscented, Cartesian", "pixels"),
-                        ("positions as measurements, Kalman filter, Cartesian; the believed rig", "positions"),
-                    )
-                ],
-            ),
-            "",
-            f"Stone Soup's filters are told whose each sighting is. Of {followed:,.0f} targets in all moments kcal's "
-            f"tracker has no position for {missed:,.0f} and two for {doubled:,.0f}.",
-        ]
-    return "\n".join(lines)
+        "draws of rig, targets and noise."
+    )
+    yield ""
+    yield from table(
+        ["range at 5 km", "RMS of error (of the inverse range, times 5 km squared)", "over its stated sigma"], rows
+    )
+    yield ""
+    yield from table(["output", "in the 95 % interval", "cases"], outputs)
+    yield ""
+    smallest = float(figures.all("floor").min())
+    yield f"Smallest eigenvalue of covariance minus systematic part, over its trace: {smallest:.1e}."
+    yield ""
+    yield (
+        f"Clock: offset of {1e3 * OFFSET:g} ms found with an RMS error of {rms(offset):.2f} ms, stated "
+        f"{rms(figures.all('clock sigma ms')):.2f} ms. A target at 30 m/s that crosses at 5 km is wrong by "
+        f"{lost[0]:.0f} m without and {lost[1]:.0f} m with it."
+    )
+    yield ""
+    mean = {name: float(np.mean(values)) for name, values in figures.numbers.items()}
+    missed, doubled, followed = (sum(figures.numbers[f"pixels: {name}"]) for name in ("missed", "doubled", "followed"))
+    kinds = {
+        "equal information: the pairs, the true rig, the clock; unscented, Cartesian": "pixels",
+        "positions as measurements, Kalman filter, Cartesian; the believed rig": "positions",
+    }
+    both = ((what, mean[f"{kind}: kcal"], mean[f"{kind}: stonesoup"]) for what, kind in kinds.items())
+    yield from table(
+        ["GOSPA (cutoff 300 m) of the targets that both follow", "kcal", "Stone Soup", "kcal over Stone Soup"],
+        ([what, f"{own:.1f} m", f"{other:.1f} m", f"{own / other:.3f}"] for what, own, other in both),
+    )
+    yield ""
+    yield (
+        f"Stone Soup's filters are told whose each sighting is. Of {followed:,.0f} targets in all moments kcal's "
+        f"tracker has no position for {missed:,.0f} and two for {doubled:,.0f}."
+    )
+    yield ""
+    yield from clock_table(figures, clock_seconds)
 
 
-def clock_report(figures: Figures, seconds: float) -> str:
+def clock_table(figures: Figures, seconds: float) -> Iterator[str]:
     error, sigma = (figures.all(name).reshape(-1, 3) for name in ("long clock", "long clock sigma"))
     rows: list[list[object]] = []
     for column, (what, true, unit, scale) in enumerate((
@@ -341,16 +318,8 @@ def clock_report(figures: Figures, seconds: float) -> str:
     )):  # fmt: skip
         inside = int((error[:, column].abs() < 1.96 * sigma[:, column]).sum())
         rows.append([
-            what, f"{scale * true:g} {unit}", f"{scale * _rms(error[:, column]):.2f} {unit}",
-            f"{scale * _rms(sigma[:, column]):.2f} {unit}", f"{inside} of {len(error)}",
+            what, f"{scale * true:g} {unit}", f"{scale * rms(error[:, column]):.2f} {unit}",
+            f"{scale * rms(sigma[:, column]):.2f} {unit}", f"{inside} of {len(error)}",
         ])  # fmt: skip
     head = [f"clock after {seconds:g} s", "truth", "RMS of error", "stated sigma", "in the 95 % interval"]
-    return "\n".join(table(head, rows))
-
-
-def _rms(values: Tensor) -> float:
-    return float(values.square().mean().sqrt())
-
-
-if __name__ == "__main__":
-    main()
+    return table(head, rows)

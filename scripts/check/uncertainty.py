@@ -1,15 +1,12 @@
-"""Whether predicted standard deviations are those of repeated captures; writes a section of docs/measured/solver.md.
-
-    python -m scripts.check.uncertainty                  300 captures with 5, 8, 14 coefficients
-    python -m scripts.check.uncertainty --refits 50 --coefficients 5
+"""Whether predicted standard deviations are those of repeated captures.
 
 One camera, one set of poses, fresh normal noise for each capture; every capture is calibrated from nothing.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -20,8 +17,8 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import row, show
+from scripts.shared.page import table
+from scripts.shared.sections import section
 from scripts.shared.views import MODELS, NOISE, SIZE, observed, simulate
 
 VIEWS = 30
@@ -81,8 +78,8 @@ def refit(pixels: Tensor, options: CalibrationOptions, truth: Camera, rays: Tens
     )
 
 
-def study(coefficients: int, weak: float | None, refits: int) -> list[str]:
-    """The rows of one model."""
+def study(coefficients: int, weak: float | None, refits: int) -> list[object]:
+    """The row of one model."""
     model = LensModel.named(MODELS[coefficients])
     truth = Camera.build(
         focal=(1600, 1600), center=(963, 536), size=SIZE, coefficients=LENS[:coefficients], model=model
@@ -123,7 +120,7 @@ def study(coefficients: int, weak: float | None, refits: int) -> list[str]:
         for part in (inside[0], inside[1], inside[0][~warned], inside[1][~warned])
     ]
     cells = [f"{center[0]:.3f}", f"{center[1]:.2f}", f"{focal[1]:.2f}", f"{corner[2]:.2f}"]
-    return show([row(named, *cells, *shares[:2], int(warned.sum()), *shares[2:])])
+    return [named, *cells, *shares[:2], int(warned.sum()), *shares[2:]]
 
 
 def ratios(error: Tensor, variance: Tensor) -> tuple[float, float, float]:
@@ -133,23 +130,10 @@ def ratios(error: Tensor, variance: Tensor) -> tuple[float, float, float]:
     return repeated, predicted / repeated, usual
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--refits", type=int, default=300)
-    parser.add_argument("--coefficients", type=int, nargs="*", default=[5, 8, 14], choices=[5, 8, 14])
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    lines = table(
-        ["coefficients", "cx: error, px", "cx: σ / error", "fx: σ / error",
-         "corner of the image, turned: σ / error, medians", "in 95 %, %", "turned, %", "warned of",
-         "the others: in 95 %, %", "turned, %"], [],
-    )  # fmt: skip
-    show(lines)
-    for coefficients in arguments.coefficients:
-        for weak in (None,) if coefficients == 5 else (None, WEAK):
-            lines += study(coefficients, weak, arguments.refits)
-    write_section("solver.md", "predicted and repeated", lines, write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+@section("solver.md", "predicted and repeated", refits=3, coefficients=(5,))
+def predicted_and_repeated(refits: int = 300, coefficients: tuple[int, ...] = (5, 8, 14)) -> Iterator[str]:
+    heads = ["coefficients", "cx: error, px", "cx: σ / error", "fx: σ / error"]
+    heads += ["corner of the image, turned: σ / error, medians", "in 95 %, %", "turned, %", "warned of"]
+    heads += ["the others: in 95 %, %", "turned, %"]
+    cases = ((count, weak) for count in coefficients for weak in ((None,) if count == 5 else (None, WEAK)))
+    return table(heads, (study(count, weak, refits) for count, weak in cases))

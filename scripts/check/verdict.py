@@ -1,20 +1,11 @@
-"""Does the verdict say yes only to captures that deserve it? A table of docs/measured/ordinary.md.
-
-    python -m scripts.check.verdict --out captures.jsonl --planted 200 --clean 100     continues where it stopped
-    python -m scripts.check.verdict --out captures.jsonl --write                       the page, from what is there
-
-Seeds below 200 were for setting the thresholds (`--first 0`); others are reported.
-"""
+"""Does the verdict say yes only to captures that deserve it? Seeds below 200 were for setting the thresholds."""
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import math
 import time
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -29,10 +20,9 @@ from kcal.report.verdict import Requirement, Verdict
 from kcal.rig import pair_by_name, paired_boards
 from kcal.sim.truth import TruthLens
 from scripts.check.verdict_captures import FAULTS, Planted, PlantedPair, drawn
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 
-FIRST = 200
 # What is required of a camera, in a rig with 10 m of baseline; of a rig, from boards alone.
 CAMERA, RIG, MARK = "2km:10%", "500m:5%", 0.1
 # Where nothing is required, a camera whose true error is more than so many times its error bars is wrong.
@@ -66,7 +56,7 @@ def true_error(lens: TruthLens, camera: Camera) -> float:
     return float((seen - grid)[good].square().sum(-1).mean().sqrt())
 
 
-def judge_camera(planted: Planted) -> tuple[Verdict, float, float, dict[str, Any]]:
+def judge_camera(planted: Planted) -> tuple[Verdict, float, float, Record]:
     """Verdict, true RMS error over the image in px, that of the range over what is required; the verdict without."""
     result = calibrate_camera(planted.observations, planted.options)
     need, found = Requirement.parse(CAMERA), examine(result, planted.options)
@@ -79,7 +69,7 @@ def judge_camera(planted: Planted) -> tuple[Verdict, float, float, dict[str, Any
     return verdict, off, slope * math.hypot(off, MARK) / need[0].meters, more
 
 
-def judge_pair(planted: PlantedPair) -> tuple[Verdict, float, float, dict[str, Any]]:
+def judge_pair(planted: PlantedPair) -> tuple[Verdict, float, float, Record]:
     """Verdict, true RMS error of ranges in meters, and over what is required."""
     cameras = []
     for seen in planted.alone:
@@ -105,11 +95,11 @@ def judge_pair(planted: PlantedPair) -> tuple[Verdict, float, float, dict[str, A
     return verdict, error, error / need.meters, {}
 
 
-def judge(kind: str, seed: int) -> dict[str, Any]:
+def judge(kind: str, seed: int) -> Record:
     """One line of the file."""
     clock = time.process_time()
     planted = drawn(kind, seed)
-    line: dict[str, Any] = {"kind": kind, "seed": seed, "detail": planted.detail}
+    line: Record = {"kind": kind, "detail": planted.detail}
     try:
         verdict, off, over, more = judge_pair(planted) if isinstance(planted, PlantedPair) else judge_camera(planted)
         line |= more | {
@@ -125,24 +115,33 @@ def judge(kind: str, seed: int) -> dict[str, Any]:
     return line | {"seconds": round(time.process_time() - clock, 2)}
 
 
-def named(line: dict[str, Any]) -> bool:
+def named(line: Record) -> bool:
     """Whether the planted fault was named."""
     refused = any(text in line["reason"] for text in REFUSALS.get(line["kind"], ()))
     return refused or bool(NAMES[line["kind"]] & {*line["stops"], *line["doubts"]})
 
 
-def broken(line: dict[str, Any], times: float) -> bool:
+def broken(line: Record, times: float) -> bool:
     """Whether the true error is so many times what is required, or more; a camera that was refused is broken."""
     return line["over"] is None or line["over"] > times
 
 
-def table_of(lines: list[dict[str, Any]]) -> list[str]:
-    """The page's table, and what happens to good captures."""
-    planted = [line for line in lines if line["kind"] in FAULTS]
-    clean = [line for line in lines if line["kind"] not in FAULTS]
+def wanted(first: int, planted: int, clean: int) -> Iterator[tuple[str, int]]:
+    """Kinds and seeds, of all kinds from the beginning."""
+    faulty = [(FAULTS[i % len(FAULTS)], first + i // len(FAULTS)) for i in range(planted)]
+    good = [(CLEAN[i % len(CLEAN)], first + i) for i in range(clean)]
+    groups = itertools.zip_longest(faulty[::2], faulty[1::2], good)
+    return (job for jobs in groups for job in jobs if job is not None)
+
+
+@section("ordinary.md", "verdict", planted=1, clean=1)
+def verdicts(kept: Kept = NOT_KEPT, planted: int = 200, clean: int = 100, first: int = 200) -> Iterator[str]:
+    """What happens to captures with a planted fault, and to good ones."""
+    lines = kept.records(wanted(first, planted, clean), judge, lambda one: f"{one['yes']}, off {one['off']}")
+    bad, fine = ([line for line in lines if (line["kind"] in FAULTS) is fault] for fault in (True, False))
     rows = []
     for kind in [*FAULTS, "all planted", "clean"]:
-        here = clean if kind == "clean" else [line for line in planted if kind in ("all planted", line["kind"])]
+        here = fine if kind == "clean" else [line for line in bad if kind in ("all planted", line["kind"])]
         if not here:
             continue
         yes, alone = [line for line in here if line["yes"]], [line for line in here if "bare" in line]
@@ -158,46 +157,8 @@ def table_of(lines: list[dict[str, Any]]) -> list[str]:
         "fault named", "nothing required: yes", f"of these, off by more than {SIGMAS:g} σ",
         f"no, though within {SIGMAS:g} σ",
     ]  # fmt: skip
-    good = [line for line in clean if not broken(line, 1.0)]
-    return [
-        *table(head, rows), "",
-        f"Of the {len(good)} clean captures that are not off by more than required, "
-        f"{sum(not line['yes'] for line in good)} got a no.",
-    ]  # fmt: skip
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="file of JSON lines; captures in it are not made again")
-    parser.add_argument("--planted", type=int, default=200)
-    parser.add_argument("--clean", type=int, default=100)
-    parser.add_argument("--first", type=int, default=FIRST, help="first seed")
-    parser.add_argument("--share", type=int, default=0, help="which share of the captures, from 0")
-    parser.add_argument("--count", type=int, default=1, help="into how many shares they are divided")
-    parser.add_argument("--only", nargs="*", help="kinds of captures")
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    lines = []
-    if arguments.out.exists():
-        lines = [json.loads(text) for text in arguments.out.read_text().splitlines()]
-    if arguments.write:
-        write_section("ordinary.md", "verdict", table_of(lines))
-        return
-    done = {(line["kind"], line["seed"]) for line in lines}
-    wanted = [(FAULTS[i % len(FAULTS)], arguments.first + i // len(FAULTS)) for i in range(arguments.planted)]
-    clean = [(CLEAN[i % len(CLEAN)], arguments.first + i) for i in range(arguments.clean)]
-    both = [job for jobs in itertools.zip_longest(wanted[::2], wanted[1::2], clean) for job in jobs if job is not None]
-    both = [job for job in both if not arguments.only or job[0] in arguments.only]
-    for kind, seed in both[arguments.share :: arguments.count]:
-        if (kind, seed) in done:
-            continue
-        line = judge(kind, seed)
-        with arguments.out.open("a") as file:
-            file.write(json.dumps(line) + "\n")
-        show(
-            [f"{kind} {seed} ({line['detail']}): {'yes' if line['yes'] else 'no'}, off {line['off']}, {line['stops']}"]
-        )
-
-
-if __name__ == "__main__":
-    main()
+    good = [line for line in fine if not broken(line, 1.0)]
+    yield from table(head, rows)
+    yield ""
+    refused = sum(not line["yes"] for line in good)
+    yield f"Of the {len(good)} clean captures that are not off by more than required, {refused} got a no."

@@ -1,8 +1,5 @@
 """Install kcal into empty environments, from wheel and sdist, with the oldest and newest dependencies, and use it.
 
-    python -m scripts.check.versions --write         # all that can be had, into the page other-programs.md
-    python -m scripts.check.versions --only oldest   # quicker, for CI
-
 Each cell is an environment of its own in a temporary folder: an interpreter, what it is installed from, and its
 dependencies. *Oldest* are the lowest versions that pyproject.toml allows, *newest* what pip chooses. In it, outside the
 repository and without extras: `kcal calibrate` of two cameras from generated corners, `kcal rig` of both, `kcal locate`
@@ -12,7 +9,7 @@ not found are named, not skipped silently.
 
 from __future__ import annotations
 
-import argparse
+import itertools
 import json
 import os
 import re
@@ -22,11 +19,13 @@ import sys
 import tempfile
 import time
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from kcal.files import make_folder
-from scripts.shared.page import DOCS, table, write_section
+from scripts.shared.page import DOCS, table
+from scripts.shared.sections import section
 from scripts.shared.timing import show
 
 ROOT = DOCS.parents[1]
@@ -175,7 +174,7 @@ def cell(folder: Path, python: str, package: Path, pins: list[str], tests: list[
         shutil.rmtree(place, ignore_errors=True)
 
 
-def filled(rows: list[list[str]], missing: list[str]) -> list[str]:
+def filled(rows: list[list[str]], missing: list[str]) -> Iterator[str]:
     """The page's table; cells that were left out are shown as not run."""
     cells = [(version, *cell) for version in PYTHONS for cell in CELLS if version not in missing]
     there = {(row[0], row[1], row[2]): row for row in rows}
@@ -183,46 +182,25 @@ def filled(rows: list[list[str]], missing: list[str]) -> list[str]:
     return table(["Python", "from", "dependencies", "torch", "numpy", "scipy", "result"], rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", choices=("oldest", "newest"), help="only these dependencies")
-    parser.add_argument("--pythons", nargs="+", default=list(PYTHONS), metavar="X.Y")
-    parser.add_argument("--tests", nargs="*", default=list(CORE), metavar="PATH", help="to run; none if only named")
-    parser.add_argument("--processes", type=int, default=1, help="that run the tests")
-    parser.add_argument("--newest-torch", default="", metavar="REQUIREMENT", help="in place of what pip chooses")
-    parser.add_argument("--out", type=Path, help="JSON lines of rows; those in it are kept and shown")
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
+@section("other-programs.md", "versions", only="none")
+def versions(
+    only: str = "", pythons: tuple[str, ...] = PYTHONS, tests: tuple[str, ...] = CORE, processes: int = 1,
+    newest_torch: str = "",
+) -> list[str]:  # fmt: skip
+    """`only`: oldest or newest dependencies. `newest_torch`: a requirement in place of what pip chooses."""
     lower = [lowest(line) for line in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]]
-    kept = arguments.out.read_text().splitlines() if arguments.out and arguments.out.exists() else []
-    rows: list[list[str]] = [json.loads(line) for line in kept]
-    missing: list[str] = []
+    rows: list[list[str]] = []
+    missing = [version for version in pythons if interpreter(version) is None]
     with tempfile.TemporaryDirectory(prefix="kcal-versions-") as name:
         folder = Path(name)
-        packages = built(folder)
+        packages = built(folder) if only != "none" else {}
         make_folder(folder / "wheels")
-        for version in arguments.pythons:
-            python = interpreter(version)
-            if python is None:
-                missing.append(version)
-                continue
-            for kind, age in CELLS:
-                done = [version, kind, age] in [row[:3] for row in rows]
-                if arguments.only in (None, age) and not done:
-                    newest = [arguments.newest_torch] if arguments.newest_torch else []
-                    pins = lower if age == "oldest" else newest
-                    found = cell(folder, python, packages[kind], pins, arguments.tests, arguments.processes)
-                    seen = found.get("versions", {})
-                    names = ("torch", "numpy", "scipy")
-                    rows.append([version, kind, age, *(seen.get(name, "") for name in names), found["outcome"]])
-                    show([" | ".join(rows[-1])])
-                    if arguments.out:
-                        with arguments.out.open("a") as file:
-                            file.write(json.dumps(rows[-1]) + "\n")
-        write_section("other-programs.md", "versions", filled(rows, missing), write=arguments.write)
-    if not rows or any(not row[-1].startswith("passed") for row in rows):
-        sys.exit(1)
-
-
-if __name__ == "__main__":
-    main()
+        for version, (kind, age) in itertools.product(pythons, CELLS):
+            if (python := interpreter(version)) is not None and only in ("", age):
+                newest = [newest_torch] if newest_torch else []
+                pins = lower if age == "oldest" else newest
+                found = cell(folder, python, packages[kind], pins, list(tests), processes)
+                seen = (found.get("versions", {}).get(one, "") for one in ("torch", "numpy", "scipy"))
+                rows.append([version, kind, age, *seen, found["outcome"]])
+                show([" | ".join(rows[-1])])
+    return [*filled(rows, missing)]

@@ -1,22 +1,17 @@
 """A watched rig on simulated looks: drifts found, false alarms, thermal swing removed, coverage of targets at 5 km.
 
-    python -m scripts.check.watch [--chains 200] [--days 5] [--every 120] [--write]
-
 Nothing is rendered. Looks have the errors that were measured of patches (docs/measured/scene.md): 0.1 px each, 300 of
 them in a camera of f 1600 px, a third of the variance lasting for hours; 0.5 % of the looks are wrong by 0.05°. Masts
 follow the air and the sun, each camera in its own way: a relative swing (below the limit of the alarm, or
-beyond) that is no process of the model. Wind turns both at every look, by 0.0002 to 0.0008°.
-Three of five rigs see nothing at night, the others an
-eighth of the features; there are gaps of half an hour. Each rig's model is learned from
+beyond) that is no process of the model. Wind turns both at every look, by 0.0002 to 0.0008°. Three of five rigs see
+nothing at night, the others an eighth of the features; there are gaps of half an hour. Each rig's model is learned from
 three days before those that count.
-With --write docs/measured/watch.md is made.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-import time
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -28,7 +23,8 @@ from kcal.rig import Mounting, RigCovariance, planned_rig
 from kcal.watch.history import AngleSeries, Look, TurnModel, between_rows, first_state, learned, passed, taken, turns_of
 from kcal.watch.turned import drift_of_turns
 from kcal.watch.watcher import LIMIT, exceeded
-from scripts.shared.page import table, write_section
+from scripts.shared.page import table
+from scripts.shared.sections import section
 
 RIG = planned_rig()
 ROWS = between_rows(RIG)
@@ -223,6 +219,7 @@ def percent(values: Tensor) -> str:
     return f"{100 * share:.1f} ± {100 * math.sqrt(share * (1 - share) / max(1, len(values))):.1f} %"
 
 
+@torch.no_grad()
 def day_and_night(
     chains: int, days: float, every: float, targets: int, peaks: tuple[float, float], *, heat: bool
 ) -> tuple[list[object], TurnModel]:
@@ -248,6 +245,7 @@ def day_and_night(
     ], model  # fmt: skip
 
 
+@torch.no_grad()
 def drifts(chains: int, every: float, model: TurnModel) -> list[list[object]]:
     """How soon a drift of the relative yaw is found, by day."""
     rows: list[list[object]] = []
@@ -271,34 +269,19 @@ def drifts(chains: int, every: float, model: TurnModel) -> list[list[object]]:
     return rows
 
 
-def main() -> None:
-    """Run all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--chains", type=int, default=200)
-    parser.add_argument("--days", type=float, default=5.0)
-    parser.add_argument("--every", type=float, default=120.0)
-    parser.add_argument("--targets", type=int, default=2000)
-    parser.add_argument("--write", action="store_true")
-    given = parser.parse_args()
-    rows = []
-    with torch.no_grad():
-        for peaks, heat in ((STRONG, True), (STRONG, False), (MILD, True), (MILD, False)):
-            begun = time.process_time()
-            # Alarms need the thousand days.
-            share = 1 if (peaks, heat) == (MILD, False) else 5
-            row, model = day_and_night(given.chains // share, given.days, given.every, given.targets, peaks, heat=heat)
-            rows.append(row)
-            print(*row, f"{time.process_time() - begun:.0f} s", sep=" | ", flush=True)
-        found = drifts(given.chains, given.every, model)
-    swing = table(["swing", "temperature", "days and nights", "false alarms", "a month", "of the swing removed by day",
-                   "in dark and gaps", "inside 95 % by day", "inside, dark and gaps",
-                   "inside, rig file"], rows)  # fmt: skip
-    drift = table(["drift of 0.01°", "rigs", "found in 10 minutes of its end", "median", "in an hour"], found)
-    print(*swing, *drift, sep="\n")
-    if given.write:
-        write_section("watch.md", "swing", swing)
-        write_section("watch.md", "drift", drift)
+@section("watch.md", "swing", chains=5, days=0.1, every=1200.0, targets=10)
+def swing(chains: int = 200, days: float = 5.0, every: float = 120.0, targets: int = 2000) -> Iterator[str]:
+    heads = ["swing", "temperature", "days and nights", "false alarms", "a month", "of the swing removed by day"]
+    heads += ["in dark and gaps", "inside 95 % by day", "inside, dark and gaps", "inside, rig file"]
+    # Alarms need the thousand days.
+    cases = ((STRONG, True, 5), (STRONG, False, 5), (MILD, True, 5), (MILD, False, 1))
+    rows = (day_and_night(chains // part, days, every, targets, peaks, heat=heat)[0] for peaks, heat, part in cases)
+    return table(heads, rows)
 
 
-if __name__ == "__main__":
-    main()
+@section("watch.md", "drift", chains=5, every=1200.0)
+def drift(chains: int = 200, every: float = 120.0) -> Iterator[str]:
+    """The model is that of a mild swing without temperatures."""
+    model = day_and_night(chains, 0.1, every, 1, MILD, heat=False)[1]
+    heads = ["drift of 0.01°", "rigs", "found in 10 minutes of its end", "median", "in an hour"]
+    return table(heads, drifts(chains, every, model))

@@ -1,22 +1,14 @@
 """Are wrong intervals from weak sets of landmarks refused or warned of? A table of docs/measured/rig.md.
 
-    python -m scripts.check.weak_geometry --out sets.jsonl           # 200 random, 200 nearly degenerate, 56 as reported
-    python -m scripts.check.weak_geometry --out sets.jsonl --write   # the page; sets in the file are not drawn again
-
 The cameras are exact, so that geometry alone decides. Each set has its own baseline, number of landmarks, noise of
 marks and of the survey, distance and shape. Targets: a grid over the image at seven distances, marked to 0.1 px.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import itertools
-import json
 import math
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Sequence
 from unittest import mock
 
 import torch
@@ -29,8 +21,9 @@ from kcal.finding import sentences
 from kcal.locate import enu_from_cam
 from kcal.rig import RigCovariance
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import table, write_section
-from scripts.shared.timing import show
+from scripts.shared.page import table
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
+from scripts.shared.timing import share
 
 # How many sets of each kind.
 KINDS = {"random": 200, "row": 50, "plane": 50, "cluster": 50, "two groups": 50, "row at 1 km": 56, "graded": 200}
@@ -100,7 +93,7 @@ def shaped(kind: str, distance: float, draw: Draw, many: int) -> Tensor:
     return torch.stack(groups, 1).flatten(0, 1)
 
 
-def drawn(kind: str, seed: int) -> tuple[Rig, Landmarks, dict[str, Any]]:
+def drawn(kind: str, seed: int) -> tuple[Rig, Landmarks, Record]:
     """A true rig, landmarks without noise, and what was drawn."""
     draw = Draw(FIRST * 10 + 10 * seed + list(KINDS).index(kind))
     if kind == "row at 1 km":
@@ -162,7 +155,7 @@ def unchecked(truth: Rig, seen: Landmarks) -> RigResult:
         return solve.solve_rig(data, solve.RigOptions(intrinsics="fixed", refraction=0.0, refraction_sigma=0.0))
 
 
-def graded(seed: int) -> tuple[Rig, Landmarks, dict[str, Any]]:
+def graded(seed: int) -> tuple[Rig, Landmarks, Record]:
     """A nearly degenerate set, with noise of marks and survey scaled so that its baseline is open by 2 to 50 %."""
     truth, exact, head = drawn(DEGENERATE[seed % len(DEGENERATE)], 10_000 + seed)
     head |= {"kind": "graded", "seed": seed}
@@ -182,7 +175,7 @@ def graded(seed: int) -> tuple[Rig, Landmarks, dict[str, Any]]:
 
 
 @torch.no_grad()
-def one(kind: str, seed: int) -> dict[str, Any]:
+def one(kind: str, seed: int) -> Record:
     """One set: what is said of it, its intervals, and those that there would be without the check."""
     truth, exact, record = graded(seed) if kind == "graded" else drawn(kind, seed)
     if record["count"] < 4:
@@ -206,11 +199,11 @@ def one(kind: str, seed: int) -> dict[str, Any]:
     return record | {"usable": 2 * sum(good) > len(good)}
 
 
-def checked(truth: Rig, found: RigResult, draw: Draw) -> dict[str, Any]:
+def checked(truth: Rig, found: RigResult, draw: Draw) -> Record:
     """What `solve_rig` makes of a result that was not checked."""
     place = assess.open_place(found._solution, 0, 1)
     assert place is not None
-    record: dict[str, Any] = {"share": place.share, "ratio": place.ratio, "found": float(found.stereo().baseline)}
+    record: Record = {"share": place.share, "ratio": place.ratio, "found": float(found.stereo().baseline)}
     try:
         widen, said = assess.check_places(found._solution, found.names)
     except KcalError as error:
@@ -223,8 +216,12 @@ def checked(truth: Rig, found: RigResult, draw: Draw) -> dict[str, Any]:
     }
 
 
-def by_kind(records: list[dict[str, Any]]) -> list[str]:
-    """How many sets are refused and warned of, and how many of their intervals contain the truth."""
+@section("rig.md", "weak geometry", part=0.001)
+def weak_geometry(kept: Kept = NOT_KEPT, part: float = 1.0) -> Iterator[str]:
+    """How many sets are refused and warned of, and of their intervals contain the truth; a part of the sets."""
+    numbers = {kind: math.ceil(part * count) for kind, count in KINDS.items()}
+    wanted = sorted((seed / KINDS[kind], kind, seed) for kind, count in numbers.items() for seed in range(count))
+    records = kept.records((each[1:] for each in wanted), one, lambda record: record["outcome"])
     heads = ("sets", "number", "refused", "warned", "accepted")
     rows = []
     groups = {"random": ("random",), "nearly degenerate, all": DEGENERATE, **{kind: (kind,) for kind in KINDS}}
@@ -245,43 +242,7 @@ def by_kind(records: list[dict[str, Any]]) -> list[str]:
     return table((*heads, *contain), rows)
 
 
-def by_ratio(records: list[dict[str, Any]]) -> list[str]:
-    """By the check's ratio, sets whose baseline is open by less than half; intervals not widened."""
-    rows = []
-    for low, high in itertools.pairwise((0, 0.9, 1.05, 1.15, 1.4, 2, 3, math.inf)):
-        own = [r for r in records if low <= r.get("ratio", -1) < high and r["share"] <= 0.5]
-        useful = sum(r["usable"] for r in own)
-        rows.append([f"{low:g} to {high:g}", len(own), percent([r["unchecked"] for r in own]), useful])
-    return table(("ratio", "sets", "contain", "usable"), rows)
-
-
 def percent(shares: Sequence[Sequence[float]]) -> str:
     """Mean over sets of the share of intervals that contain the truth, with its standard error."""
-    if len(shares) < 2:
-        return "" if not shares else f"{100 * sum(shares[0]) / len(shares[0]):.1f} %"
-    means = torch.tensor(shares, dtype=torch.float64).mean(1)
-    return f"{100 * float(means.mean()):.1f} ± {100 * float(means.std()) / math.sqrt(len(means)):.1f} %"
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="JSON lines, continued if it is there")
-    parser.add_argument("--share", type=float, default=1.0, help="of the sets")
-    parser.add_argument("--write", action="store_true", help="write the table into the page")
-    arguments = parser.parse_args()
-    out = arguments.out
-    records = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
-    done = {(record["kind"], record["seed"]) for record in records}
-    wanted = [(kind, seed) for kind, count in KINDS.items() for seed in range(math.ceil(arguments.share * count))]
-    for kind, seed in sorted(wanted, key=lambda each: each[1] / KINDS[each[0]]):
-        if (kind, seed) not in done:
-            records.append(one(kind, seed))
-            with out.open("a") as file:
-                file.write(json.dumps(records[-1]) + "\n")
-    lines = show(by_kind(records))
-    show(by_ratio(records))
-    write_section("rig.md", "weak geometry", lines, write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+    means = [sum(each) / len(each) for each in shares]
+    return share(means, " %") if len(means) > 1 else "".join(f"{100 * mean:.1f} %" for mean in means)

@@ -1,26 +1,21 @@
-"""The paper's chain beside kcal's default camera, on its simulated site and on real captures (docs/measured/paper.md).
-
-    KCAL_DATA=DATA python -m scripts.paper.chain --work FOLDER [--write]
+"""The paper's chain beside kcal's default camera, on its simulated site and on real captures.
 
 Lenses: 20 coefficients (Eq. 10); the same with the residual net as written (Eq. 11, trained on Eq. 12 by least
 squares); kcal's lens with a network as its field, which depends on the position as Fig. 8 draws it, with its first
 layer fixed and trained; and the default. Each is fitted to all views, and to the first and the second half of them. A
 half judges the camera of the other half, which has seen none of its views, by its projection alone, with poses and
 board refitted (`scripts.shared.held_out`), without and with each view's own motion. Error bars are honest where these
-two cameras differ by no more than both state (`kcal.lens.camera_difference`). What FOLDER has is not made again.
+two cameras differ by no more than both state (`kcal.lens.camera_difference`).
 """
 
 from __future__ import annotations
 
-import argparse
+import functools
 import math
 import statistics
 import time
 from collections.abc import Sequence
 from pathlib import Path
-
-import cv2
-import torch
 
 from kcal import Camera, KcalError, Observations
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
@@ -29,12 +24,11 @@ from scripts.paper.site import KINDS, observe, paper_scene
 from scripts.paper.train_eq12 import by_least_squares
 from scripts.shared.held_out import held_out
 from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import table, write_section
-from scripts.shared.real_captures import data_folder, load, names
-from scripts.shared.records import Record, finish
-from scripts.shared.timing import show
+from scripts.shared.page import table
+from scripts.shared.real_captures import load, names
+from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 
-PAGE, SITE, VIEWS = "paper.md", "site ", 30
+SITE, VIEWS = "site ", 30
 RESIDUAL = "ext20 + Eq. 11"
 LENSES = {
     "ext20": CalibrationOptions(model="ext20"),
@@ -58,7 +52,7 @@ def fitted(seen: Observations, lens: str) -> tuple[Camera, float]:
 def observed(capture: str, work: Path, views: int = VIEWS) -> Observations:
     """The views of a real capture, or of the left camera of a kind of the paper's site."""
     if not capture.startswith(SITE):
-        return load(capture, data_folder(), work / "corners").seen
+        return load(capture).seen
     name, folder = capture.removeprefix(SITE), work / capture.replace(" ", "-")
     path = folder / "left.kcal.json"
     if not path.exists():
@@ -134,26 +128,12 @@ def lines(records: Sequence[Record]) -> list[str]:
     return [*summary(records), *table(HEADS, [[*record["key"], *cells(record)] for record in ordered])]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, required=True, help="folder for corners and results; kept")
-    parser.add_argument("--captures", nargs="+", help="names, or 'site glass' and so on; all if left out")
-    parser.add_argument("--lenses", nargs="+", default=list(LENSES))
-    parser.add_argument("--write", action="store_true", help=f"also write the section of docs/measured/{PAGE}")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)  # sums in one order, so that a run can be repeated
-    captures = arguments.captures or [*(SITE + kind for kind in KINDS), *names(data_folder())]
-    keys = [(capture, lens) for capture in captures for lens in arguments.lenses]
-    records = finish(
-        arguments.work / "chain.jsonl",
-        keys,
-        lambda capture, lens: measured(capture, lens, arguments.work),
-        lambda r: " | ".join(cells(r)),
-    )
-    show(lines(records))
-    write_section(PAGE, "chain", lines(records), write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+@section("paper.md", "chain", captures=("sq1280",), lenses=("default",))
+def whole_chain(
+    kept: Kept = NOT_KEPT, captures: tuple[str, ...] = ("all",), lenses: tuple[str, ...] = tuple(LENSES),
+    work: Path = Path("build/paper"),
+) -> list[str]:  # fmt: skip
+    """Names of captures, or 'site glass' and so on; images of the site stay in a folder."""
+    wanted = [*(SITE + kind for kind in KINDS), *names()] if captures == ("all",) else captures
+    keys = [(capture, lens) for capture in wanted for lens in lenses]
+    return lines(kept.records(keys, functools.partial(measured, work=work), lambda r: " | ".join(cells(r))))

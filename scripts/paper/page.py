@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator
 
 from scripts.paper.numbers import TABLE_3, Results, median, number, position
 from scripts.paper.range import choice, distance, edges
@@ -12,22 +13,7 @@ from scripts.paper.tables import table_1, table_2, table_3
 from scripts.shared.page import table
 
 
-def sections(results: Results) -> dict[str, list[str]]:
-    """The lines of each section of the page."""
-    return {
-        "split": split(results),
-        "table 1": table_1(results),
-        "table 2": table_2(),
-        "table 3": table_3(results),
-        "models": _figure_3(results),
-        "marks": _marks(results),
-        "distance": distance(results),
-        "choice": choice(results),
-        "edges": edges(results),
-    }
-
-
-def _figure_3(results: Results) -> list[str]:
+def _figure_3(results: Results) -> Iterator[str]:
     models, rows = [*TABLE_3, "hybrid"], []
     for name, runs in results.items():
         positions = {m: [position(run, m) for run in runs] for m in models}
@@ -43,7 +29,7 @@ def _figure_3(results: Results) -> list[str]:
     return table(["camera", "", *models], rows)
 
 
-def _marks(results: Results) -> list[str]:
+def _marks(results: Results) -> Iterator[str]:
     shown = [("14", "integer"), ("14", "marked"), ("20", "marked"), ("hybrid", "marked")]
     rows = []
     for name, runs in results.items():
@@ -58,3 +44,16 @@ def _far_share(runs: list[dict], label: str, kind: str) -> float:
         for true, found in zip(run["targets"][3:], run["located"][label][kind][3:], strict=True):
             errors.append(abs(math.hypot(*found) / math.hypot(*true) - 1.0))
     return median(errors)
+
+
+SECTIONS: dict[str, Callable[[Results], Iterable[str]]] = {
+    "split": split,
+    "table 1": table_1,
+    "table 2": lambda _: table_2(),
+    "table 3": table_3,
+    "models": _figure_3,
+    "marks": _marks,
+    "distance": distance,
+    "choice": choice,
+    "edges": edges,
+}

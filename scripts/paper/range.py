@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 from scripts.paper.numbers import (
     DISTANCES,
@@ -73,7 +74,7 @@ def choice(results: Results) -> list[str]:
     ]
 
 
-def edges(results: Results) -> list[str]:
+def edges(results: Results) -> Iterator[str]:
     rows = []
     for name, runs in results.items():
         for which, title in ((0, "center"), (1, "edge")):

@@ -1,7 +1,5 @@
 """The paper's joint training of a residual and an inverse net (Eq. 12), by Adam and by least squares.
 
-    python -m scripts.paper.train_eq12 [--steps 2000] [--views 30] [--write]
-
 A camera is calibrated with 20 coefficients on simulated views through a lens of 14; its residual net (Eq. 11) and an
 inverse net are then trained together on the same corners with A*, K* and the poses held (`kcal.nets.train_jointly`), by
 Adam at the learning rate of the residual that ends lowest after a tenth of the steps, and by Levenberg-Marquardt. Held
@@ -10,11 +8,10 @@ out are other views, whose poses alone are solved. The last rows train the inver
 
 from __future__ import annotations
 
-import argparse
 import functools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 import torch
@@ -26,11 +23,12 @@ from kcal.calibrate.camera.trust import seen_pixels
 from kcal.lens.camera import Camera
 from kcal.nets.inverse import InverseFit, InverseNetOptions, train_inverse
 from kcal.nets.joint import JointFit, JointOptions, train_jointly
-from scripts.shared.page import table, tell
+from scripts.shared.page import table
+from scripts.shared.sections import section
 from scripts.shared.views import observed, simulate
 from scripts.shared.wide_lens import held_out, warped
 
-PAGE, MODEL = "paper.md", "ext20"
+MODEL = "ext20"
 RATES, TRIAL = [10.0**e for e in range(-6, 0)], 0.1
 HEADS = [
     "trained", "loss, px²", "corners, RMS px", "held out, RMS px", "inverse at the corners, RMS px",
@@ -97,15 +95,6 @@ def rows(steps: int, views: int, hidden: tuple[int, int] = (8, 12)) -> list[list
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=2000)
-    parser.add_argument("--views", type=int, default=30)
-    parser.add_argument("--write", action="store_true", help=f"also write the section of docs/measured/{PAGE}")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    tell(PAGE, "eq 12", table(HEADS, rows(arguments.steps, arguments.views)), write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+@section("paper.md", "eq 12", steps=2, views=4)
+def eq_12(steps: int = 2000, views: int = 30) -> Iterator[str]:
+    return table(HEADS, rows(steps, views))

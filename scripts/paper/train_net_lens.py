@@ -1,6 +1,4 @@
-"""Calibration with a pure network lens by gradient descent, Adam and Levenberg-Marquardt (docs/measured/paper.md).
-
-    python -m scripts.paper.train_net_lens [--steps 2000] [--seeds 3] [--write]
+"""Calibration with a pure network lens by gradient descent, Adam and Levenberg-Marquardt.
 
 The paper (Section 4.3.1, Fig. 5) put a network of four layers in the place of the distortion vector, trained it with
 Adam, and found that it diverges. Here gradient descent, Adam and Levenberg-Marquardt get the same residuals, views,
@@ -12,9 +10,9 @@ solved.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,11 +27,11 @@ from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.problem.views import Views, poses_under
 from kcal.solve.lm import LMOptions, State, minimize
 from scripts.paper.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
-from scripts.shared.page import write_section
-from scripts.shared.timing import median, row, show, spread
+from scripts.shared.page import table
+from scripts.shared.sections import section
+from scripts.shared.timing import median, spread
 from scripts.shared.views import NOISE, SIZE, observed, simulate
 
-PAGE = "paper.md"
 VIEWS, HELD_OUT = 20, 20
 # Half the image's width in focal lengths, a little more.
 REACH = 0.65
@@ -119,8 +117,7 @@ def reference(board: Tensor, pixels: Tensor, others: Tensor) -> list[str]:
     poses, _ = poses_under(result.camera, views, LMOptions(max_iterations=100))
     points = board @ poses.rotation.transpose(-1, -2) + poses.translation[:, None]
     error = (result.camera.project(points)[0] - others).norm(dim=-1).square().mean().sqrt()
-    cells = ("14 coefficients", LM, "", f"{seconds:.1f}", f"{result.rms:.4f}", f"{error:.4f}")
-    return show([row(*cells)])
+    return ["14 coefficients", LM, "", f"{seconds:.1f}", f"{result.rms:.4f}", f"{error:.4f}"]
 
 
 def draw(runs: dict[str, dict[str, list[Run]]], path: Path) -> None:
@@ -142,58 +139,36 @@ def draw(runs: dict[str, dict[str, list[Run]]], path: Path) -> None:
     figure.savefig(path, dpi=90)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=2000)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--write", action="store_true", help=f"write the table of docs/measured/{PAGE}")
-    parser.add_argument("--picture", type=Path, help="draw RMS over steps into this file")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+@section("paper.md", "net lens", steps=1, seeds=1)
+def net_lens(steps: int = 2000, seeds: int = 3, picture: Path | None = None) -> Iterator[str]:
+    """`picture`: draw RMS over steps into this file."""
     data, more = simulate(VIEWS), simulate(HELD_OUT, seed=1000)
     board, pixels, others = (torch.from_numpy(a) for a in (data["board"], data["pixels"], more["pixels"]))
     true_poses = torch.from_numpy(more["rotation"]), torch.from_numpy(more["translation"])
     base = fit_projection(board, pixels, SIZE, torch.ones_like(pixels[..., 0])).state
     intrinsics, poses = base.parameters[:4], (base.rotation, base.translation)
-    lines = [
-        "| network | method | learning rate | CPU s | RMS px | held-out RMS px |",
-        "|---|---|---|---|---|---|",
-    ]
-    show(lines)
-    lines += reference(board, pixels, others)
+    rows = [reference(board, pixels, others)]
     runs: dict[str, dict[str, list[Run]]] = {}
     for form, skip in (("as in the figure", False), ("with a skip", True)):
         runs[form] = {}
         for method in (*METHODS, LM):
             repeats, outside = [], []
             rate: float | None = None
-            for seed in range(arguments.seeds):
+            for seed in range(seeds):
                 lens = PureLensNet(intrinsics, reach=REACH, skip=skip, seed=seed)
                 problem = PureLensProblem(board, pixels, lens)
                 start = problem.start(*poses)
                 if method == LM:
                     repeats.append(by_lm(lens, board, pixels, poses))
                 else:
-                    rate = best_rate(problem, start, method, arguments.steps) if rate is None else rate
-                    repeats.append(descend(problem, start, method, rate, arguments.steps))
+                    rate = best_rate(problem, start, method, steps) if rate is None else rate
+                    repeats.append(descend(problem, start, method, rate, steps))
                 outside.append(held_out(board, others, lens, repeats[-1].state, true_poses))
             runs[form][method] = repeats
-            lines += show(
-                [
-                    row(
-                        form,
-                        method,
-                        "" if rate is None else f"{rate:.0e}",
-                        median([run.seconds for run in repeats]),
-                        spread([float(np.nanmin(run.rms)) for run in repeats], 4),
-                        spread(outside, 4),
-                    )
-                ]
-            )
-    if arguments.picture:
-        draw(runs, arguments.picture)
-    write_section(PAGE, "net lens", lines, write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+            rows.append([
+                form, method, "" if rate is None else f"{rate:.0e}", median([run.seconds for run in repeats]),
+                spread([float(np.nanmin(run.rms)) for run in repeats], 4), spread(outside, 4),
+            ])  # fmt: skip
+    if picture:
+        draw(runs, picture)
+    return table(["network", "method", "learning rate", "CPU s", "RMS px", "held-out RMS px"], rows)

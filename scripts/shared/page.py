@@ -6,10 +6,10 @@ Read the conclusion again whenever a table changes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from scripts.shared.timing import row, show
+from scripts.shared.timing import row
 
 DOCS = Path(__file__).parents[2] / "docs" / "measured"
 
@@ -31,11 +31,6 @@ def write_section(page: str, name: str, text: str | list[str], *, write: bool = 
     path.write_text(whole, encoding="utf-8")
 
 
-def tell(page: str, name: str, lines: list[str], *, write: bool) -> None:
-    """Print a section, and put it into its page if `write`."""
-    write_section(page, name, show(lines), write=write)
-
-
 def read_section(page: str, name: str) -> str:
     """What `write_section` put there; empty if it never did."""
     whole = (DOCS / page).read_text(encoding="utf-8")
@@ -43,26 +38,24 @@ def read_section(page: str, name: str) -> str:
     return whole.split(begin)[1].split(end)[0].strip() if begin in whole else ""
 
 
-def write_row(page: str, name: str, heads: Sequence[object], cells: Sequence[object]) -> None:
-    """Put a row into the table that is a section of a page, in place of the one with the same first cell.
-
-    A cell that is None stays as it was.
-    """
+def merged(
+    page: str, name: str, heads: Sequence[object], rows: Iterable[Sequence[object]], keys: int = 1
+) -> Iterator[str]:
+    """The table of a page with some rows anew, which their first cells tell; a cell that is None stays as it is."""
     lines = read_section(page, name).splitlines()
-    rows = [line.strip("| ").split(" | ") for line in lines[2:]] if lines[:1] == [row(*heads)] else []
-    place = next((i for i, old in enumerate(rows) if old[0] == cells[0]), len(rows))
-    before = [*rows[place], *[""] * len(heads)] if place < len(rows) else [""] * len(heads)
-    rows[place : place + 1] = [[old if new is None else str(new) for old, new in zip(before, cells, strict=False)]]
-    write_section(page, name, table(heads, rows))
+    whole = [line.strip("| ").split(" | ") for line in lines[2:]] if lines[:1] == [row(*heads)] else []
+    whole = [cells for cells in whole if len(cells) == len(heads)]
+    for cells in rows:
+        key = [str(cell) for cell in cells[:keys]]
+        at = next((i for i, old in enumerate(whole) if old[:keys] == key), len(whole))
+        before = [*whole[at : at + 1], [""] * len(heads)][0]
+        whole[at : at + 1] = [[old if new is None else str(new) for old, new in zip(before, cells, strict=True)]]
+    return table(heads, whole)
 
 
-def rows_of_others(page: str, name: str, column: int, here: Iterable[str]) -> list[list[str]]:
-    """Rows of a table on a page whose cell in a column is none of those measured here: of programs that are missing."""
-    known = set(here)
-    found = [line.strip("| ").split(" | ") for line in read_section(page, name).splitlines()[2:]]
-    return [cells for cells in found if cells[column].strip() not in known]
-
-
-def table(heads: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]:
-    """A Markdown table."""
-    return [row(*heads), row(*["---"] * len(heads)), *(row(*cells) for cells in rows)]
+def table(heads: Sequence[object], rows: Iterable[Sequence[object]]) -> Iterator[str]:
+    """The lines of a Markdown table, each as soon as its row is there."""
+    yield row(*heads)
+    yield row(*["---"] * len(heads))
+    for cells in rows:
+        yield row(*cells)

@@ -20,7 +20,7 @@ from kcal.sim.truth import TruthLens
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
 from scripts.shared.prescriptions import PRESCRIPTIONS
-from scripts.shared.records import Record
+from scripts.shared.sections import Record
 
 BOARD = Board(columns=7, rows=6, square=0.05)
 LENSES = ("webcam", "machine-vision", "surveillance")

@@ -1,11 +1,15 @@
-"""What the benchmarks of this folder share: calls timed in turn, so that ratios are taken within a round."""
+"""What benchmarks and checks share: calls timed in turn, so that ratios are taken within a round; statistics."""
 
 from __future__ import annotations
 
 import math
+import resource
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
 
 # A call faster than this is repeated within a round until it takes as long.
 SHORTEST_S = 0.003
@@ -57,3 +61,22 @@ def show(lines: list[str]) -> list[str]:
     """Print lines and return them."""
     print("\n".join(lines), flush=True)
     return lines
+
+
+def rms(values: Any) -> float:
+    """Root mean square of numbers, an array or a tensor."""
+    return float(np.sqrt(np.square(np.asarray(values, dtype=float)).mean()))
+
+
+def share(values: Iterable[float], unit: str = "") -> str:
+    """Mean of shares in percent, with its standard error if draws are independent; NaN is left out."""
+    known = [100.0 * value for value in values if math.isfinite(value)]
+    if len(known) < 2:
+        return "–"
+    return f"{statistics.fmean(known):.1f} ± {statistics.stdev(known) / math.sqrt(len(known)):.1f}{unit}"
+
+
+def children_seconds() -> float:
+    """Processor time of the processes that this one has started and that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +20,7 @@ EXACT = LMOptions(max_iterations=60, tolerance=1e-12)
 
 
 def load() -> tuple[Observations, np.ndarray]:
-    folder = os.environ.get("KCAL_DATA")
-    if not folder:
-        raise SystemExit("set KCAL_DATA to the folder that holds wide_lens_corners.npz")
-    with np.load(Path(folder, "wide_lens_corners.npz")) as data:
+    with np.load(data_folder() / "wide_lens_corners.npz") as data:
         corners, weight, size = data["corners"], data["weight"], data["image_size"]
         columns, rows = (int(n) for n in data["board_size"])
         board = Board(columns=columns, rows=rows, square=float(data["square_m"]))
@@ -59,5 +58,25 @@ def held_out(camera: Camera, points: torch.Tensor, seen: Observations, weight: t
     return 2.0 * float(torch.nan_to_num(cost, nan=math.inf).sum()), int((weight > 0).sum())
 
 
-def subset(seen: Observations, index: np.ndarray) -> Observations:
-    return seen.subset([seen.names[i] for i in index])
+def over_parts(
+    fit: Callable[[Observations, torch.Tensor], tuple[Camera, torch.Tensor]], seen: Observations, weight: torch.Tensor,
+    parts: Sequence[np.ndarray],
+) -> tuple[float, float]:  # fmt: skip
+    """Held-out RMS over all parts of the views, pixels, and CPU seconds of one fit, a camera and its board (N, 3)."""
+    total, seconds, count = 0.0, 0.0, 0
+    for out in parts:
+        train = np.setdiff1d(np.arange(len(seen.views)), out)
+        start = time.process_time()
+        camera, points = fit(seen.subset([seen.names[i] for i in train]), weight[train])
+        seconds += time.process_time() - start
+        error, corners = held_out(camera, points, seen.subset([seen.names[i] for i in out]), weight[out])
+        total, count = total + error, count + corners
+    return math.sqrt(total / count), seconds / len(parts)
+
+
+def data_folder() -> Path:
+    """What KCAL_DATA names."""
+    folder = os.environ.get("KCAL_DATA")
+    if not folder:
+        raise SystemExit("set KCAL_DATA to the folder that holds the real captures")
+    return Path(folder)

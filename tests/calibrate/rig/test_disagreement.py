@@ -4,10 +4,9 @@ import dataclasses
 
 import pytest
 
-from kcal import RigData, solve_rig
+from kcal import Baseline, RigData, solve_rig
 from kcal.calibrate.rig.result import RigResult
-from scripts.check.contradictions import surveyed
-from scripts.check.rig import STRAIGHT
+from scripts.check.rig import BASELINE, NAMES, STRAIGHT, TRUTH, generator, landmarks
 
 
 def yaw_sigma(found: RigResult) -> float:
@@ -16,7 +15,9 @@ def yaw_sigma(found: RigResult) -> float:
 
 @pytest.fixture(scope="module")
 def clean() -> RigData:
-    return surveyed("30 landmarks", 5)
+    tape = Baseline(first=0, second=1, length=BASELINE, sigma=0.005)
+    marked = landmarks(generator(5), 30)
+    return RigData(cameras=(TRUTH.left, TRUTH.right), names=NAMES, landmarks=marked, baselines=(tape,))
 
 
 @pytest.fixture(scope="module")
