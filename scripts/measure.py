@@ -38,7 +38,7 @@ _TOLD = ("torch", "numpy", "scipy", "opencv-contrib-python-headless", "kornia")
 def load(page: str) -> list[Section]:
     """Import every script that has sections of a page; they come in the page's order."""
     for path in sorted(ROOT.glob("*/*.py")):
-        if re.search(rf'^@?section\(\s*"{page}\.md"', path.read_text(encoding="utf-8"), re.MULTILINE):
+        if re.search(rf'^ *@?section\(\s*"{page}\.md"', path.read_text(encoding="utf-8"), re.MULTILINE):
             try:
                 importlib.import_module(f"scripts.{path.parent.name}.{path.stem}")
             except ImportError as error:
@@ -114,10 +114,17 @@ def main(arguments: list[str] | None = None) -> None:
     if page and page not in known:
         raise SystemExit(f"{page!r} is no page; there are {', '.join(known)}")
     own = [each for one in ([page] if page else known) for each in load(one)]
+    names = [each.name for each in own] if page else []
+
+    def known_section(name: str) -> str:
+        if name not in names:
+            raise argparse.ArgumentTypeError(f"{name!r} is no section; there are {', '.join(names)}")
+        return name
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page", nargs="?", help=f"{', '.join(known)}; all if none is given")
-    names = [each.name for each in own] if page else []
-    parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"{', '.join(names)}; all if none is given")
+    told = f"{', '.join(names)}; all if none is given"
+    parser.add_argument("sections", nargs="*", metavar="SECTION", type=known_section, help=told)
     options = {name: default for each in own for name, default in each.options.items()} if page else {}
     kept = "kept" in options
     for name, default in options.items():
@@ -129,8 +136,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="in little: that they run, not what they find")
     parser.add_argument("--write", action="store_true", help="write the sections into their pages")
     given = vars(parser.parse_args(words))
-    if unknown := set(given["sections"]) - set(names):
-        parser.error(f"{min(unknown)!r} is no section; there are {', '.join(names)}")
     if kept:
         given["kept"] = Kept(tuple(given.pop("out")), given.pop("only_kept"))
     for each in own:

@@ -203,19 +203,6 @@ def test_a_measured_page_concludes_and_then_shows(page: Path) -> None:
     assert re.search(r"`(python -m scripts\.|scripts/)", "".join(shown))
 
 
-@pytest.mark.parametrize("page", MEASURED, ids=[page.stem for page in MEASURED])
-def test_a_script_writes_each_table(page: Path) -> None:
-    """Every section is closed, and a script that names the page, or one beside it, names the section."""
-    text = page.read_text(encoding="utf-8")
-    sections = re.findall(r"<!-- begin: (.+) -->", text)
-    assert sections == re.findall(r"<!-- end: (.+) -->", text)
-    assert len(sections) == len(set(sections)) > 0
-    scripts = {path: path.read_text(encoding="utf-8") for path in (ROOT / "scripts").rglob("*.py")}
-    folders = {path.parent for path, script in scripts.items() if f'"{page.name}"' in script}
-    own = [script for path, script in scripts.items() if path.parent in folders]
-    assert [name for name in sections if not any(f'"{name}"' in script for script in own)] == []
-
-
 def test_how_often_intervals_are_right_is_one_figure_of_the_whole_chain() -> None:
     """The table of `scripts.check.chain` gives it; the other pages link to it and state no other one."""
     text = (ROOT / "docs" / "measured" / "chain.md").read_text(encoding="utf-8")

@@ -9,10 +9,15 @@ import re
 import runpy
 import shlex
 import sys
+import time
 import tomllib
 from pathlib import Path
 
 import pytest
+
+from scripts import measure
+from scripts.shared import page as shared_page
+from scripts.shared.sections import Section
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs" / "measured").glob("*.md"))
@@ -33,8 +38,6 @@ class ParsedError(Exception):
 def parse(command: str, patch: pytest.MonkeyPatch) -> None:
     """Start the script of a command, and stop it when it has read its arguments."""
     words = [word for word in shlex.split(command) if not re.match(r"[A-Z_]+=", word)]
-    source = (ROOT / f"{words[2].replace('.', '/')}.py").read_text(encoding="utf-8")
-    assert re.search(r"argparse\.ArgumentParser\(|^    run\(\)$", source, re.MULTILINE), "it would run, not parse"
     patch.setattr(sys, "argv", words[2:])
     read = argparse.ArgumentParser.parse_args
 
@@ -43,7 +46,10 @@ def parse(command: str, patch: pytest.MonkeyPatch) -> None:
         raise ParsedError
 
     patch.setattr(argparse.ArgumentParser, "parse_args", stop)
-    runpy.run_module(words[2], run_name="__main__", alter_sys=True)
+    if words[2] == "scripts.measure":
+        measure.main()
+    else:
+        runpy.run_module(words[2], run_name="__main__", alter_sys=True)
 
 
 @pytest.mark.filterwarnings("ignore:'scripts:RuntimeWarning")
@@ -53,11 +59,51 @@ def test_a_command_exists_with_its_options(page: str, command: str, monkeypatch:
         parse(command, monkeypatch)
 
 
-@pytest.mark.filterwarnings("ignore:'scripts:RuntimeWarning")
-@pytest.mark.parametrize("wrong", ["python -m scripts.bench.corners --wrote", "python -m scripts.check.stars reel"])
+@pytest.mark.parametrize("wrong", ["stars real --wrote", "stars reel", "sky real"])
 def test_a_wrong_option_is_seen(wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SystemExit):
-        parse(wrong, monkeypatch)
+        parse(f"python -m scripts.measure {wrong}", monkeypatch)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_a_function_makes_each_table(page: Path) -> None:
+    """Every section is closed, and has a function; of mistakes that are planted, a script of its own."""
+    text = page.read_text(encoding="utf-8")
+    names = re.findall(r"<!-- begin: (.+) -->", text)
+    assert names == re.findall(r"<!-- end: (.+) -->", text)
+    made = [each.name for each in measure.load(page.stem) if each.name != "picture"]
+    assert sorted(made) == sorted(names) or (page.stem, names) == ("mutants", ["mutants"])
+
+
+# A section of many pages that takes few seconds, without real data and without other programs.
+IN_LITTLE = (
+    "lens no ray", "locate accuracy", "rig faults", "settings settings", "stars random", "stations coverage",
+    "watch drift", "solver first-order methods", "paper eq 12", "precision limits", "ordinary aspect",
+    "other-programs devices",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("section", IN_LITTLE)
+def test_a_section_is_made_in_little(section: str, capsys: pytest.CaptureFixture[str]) -> None:
+    measure.main([*section.split(" ", 1), "--quick"])
+    lines = capsys.readouterr().out.splitlines()
+    assert "left out" not in lines[1]
+    assert lines[-1].endswith(" CPU s")
+    assert len(lines) > 2
+
+
+def test_a_table_says_what_made_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(shared_page, "DOCS", tmp_path)
+    (tmp_path / "lens.md").write_text("# Page\n")
+    each = Section("lens.md", "two words", lambda seeds=range(9), names=("a",): ["| x |"], {"seeds": range(1)})
+    measure.make(each, {"seeds": range(2, 4)}, quick=True, write=True)
+    assert "| x |" not in (tmp_path / "lens.md").read_text()
+    measure.make(each, {"seeds": range(2, 4)}, quick=False, write=True)
+    table, made = shared_page.read_section("lens.md", "two words").split("\n\n")
+    assert table == "| x |"
+    assert "python -m scripts.measure lens 'two words' --seeds 2-3 --names a, " in made
+    assert all(word in made for word in ("commit ", " CPUs", "Python 3", "torch 2", time.strftime("%Y-")))
 
 
 @functools.cache
@@ -118,6 +164,7 @@ def test_a_page_says_what_its_commands_need(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     told = text[text.rindex("\n**To repeat**") :]
     assert "`pip install -e '.[bench]'`" in told
-    asked = {name for command in commands(page) for name in needs(command.split("-m ")[1].split()[0])}
+    own = {each.make.__module__ for each in measure.load(page.stem)} or {"scripts.check.mutants"}
+    asked = {name for module in own for name in needs(module)}
     assert commands(page)
     assert {name for name in asked if f"`{name}`" not in told} == set()

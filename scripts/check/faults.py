@@ -96,16 +96,16 @@ def contained(found: RigResult) -> list[bool]:
     return (error.abs() <= WITHIN * found.relative_covariance().diagonal().sqrt()).tolist()
 
 
-@section("rig.md", "faults", seeds=1)
-def of_rigs(seeds: int = 20) -> Iterator[str]:
+@section("rig.md", "faults", seeds=range(1))
+def of_rigs(seeds: range = range(20)) -> Iterator[str]:
     return table(["rigs", "refused", "named", "plain", "left out", "contained"], _rig_rows(seeds))
 
 
-def _rig_rows(seeds: int) -> Iterator[list[object]]:
+def _rig_rows(seeds: range) -> Iterator[list[object]]:
     for kind, make in RIGS.items():
         refused = named = plain = out = 0
         inside: list[bool] = []
-        for seed in range(seeds):
+        for seed in seeds:
             sources, wrong = make(seed)
             try:
                 found = solve_rig(sources, STRAIGHT)
@@ -119,7 +119,7 @@ def _rig_rows(seeds: int) -> Iterator[list[object]]:
             plain += not gone and not found.warnings
             inside += contained(found)
         share = f"{sum(inside) / len(inside):.2f}" if inside else "–"
-        yield [kind, f"{refused}/{seeds}", named, plain, out, share]
+        yield [kind, f"{refused}/{len(seeds)}", named, plain, out, share]
 
 
 def changed(seen: Observations, second: set[int], change: Callable[[Tensor], Tensor]) -> Observations:
@@ -144,10 +144,10 @@ def mixed(one: Observations, other: Observations) -> Observations:
     return one.model_copy(update={"views": (*first, *second)})
 
 
-def captures(seeds: int) -> Iterator[tuple[str, Observations, set[int]]]:
+def captures(seeds: range) -> Iterator[tuple[str, Observations, set[int]]]:
     """Kind, views, and which of them are of the second group; none in good captures."""
     odd, late = set(range(1, VIEWS, 2)), set(range(VIEWS // 2, VIEWS))
-    for seed in range(seeds):
+    for seed in seeds:
         for by_hand in (False, True):
             seen, how = simulated(seed, VIEWS, NOISE, by_hand).seen, "by hand" if by_hand else "on a stand"
             middle = 0.5 * torch.tensor(seen.image_size, dtype=torch.float64)
@@ -169,8 +169,8 @@ def rightly(text: str, seen: Observations, second: set[int]) -> float:
     return max(right, len(seen.views) - right) / len(seen.views)
 
 
-@section("ordinary.md", "two cameras", seeds=1)
-def of_captures(seeds: int = 4) -> Iterator[str]:
+@section("ordinary.md", "two cameras", seeds=range(1))
+def of_captures(seeds: range = range(4)) -> Iterator[str]:
     found: dict[str, list[float | None]] = {}
     for kind, seen, second in captures(seeds):
         share: float | None = None

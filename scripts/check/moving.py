@@ -189,10 +189,10 @@ def one_draw(name: str, seed: int) -> Outcome:
     )  # fmt: skip
 
 
-def row_of(name: str, seeds: int) -> list[str]:
+def row_of(name: str, seeds: range) -> list[str]:
     """A row of the table."""
     found, refused = [], 0
-    for seed in range(seeds):
+    for seed in seeds:
         try:
             found.append(one_draw(name, seed))
         except KcalError as error:
@@ -205,7 +205,7 @@ def row_of(name: str, seeds: int) -> list[str]:
     return [
         name, f"{rms(value[:, 0]):.5f}", f"{float(value[:, 1].median()):.5f}", f"{inside:.0%}",
         f"{float(value[:, 2].mean() / 3):.2f}", f"{rms(value[:, 3]):.4f}", f"{float(value[:, 4].median()):.4f}",
-        f"{known:.0%}", f"{float(value[:, 5].mean()):.1%}", f"{int(value[:, 6].sum())}", f"{refused} of {seeds}",
+        f"{known:.0%}", f"{float(value[:, 5].mean()):.1%}", f"{int(value[:, 6].sum())}", f"{refused} of {len(seeds)}",
         f"{float(value[:, 7].median()):.1f}",
     ]  # fmt: skip
 
@@ -216,6 +216,6 @@ HEADS = (
 )  # fmt: skip
 
 
-@section("moving.md", "moving", kinds=tuple(KINDS)[:1], seeds=1)
-def moving(kinds: tuple[str, ...] = tuple(KINDS), seeds: int = 30) -> Iterator[str]:
+@section("moving.md", "moving", kinds=tuple(KINDS)[:1], seeds=range(1))
+def moving(kinds: tuple[str, ...] = tuple(KINDS), seeds: range = range(30)) -> Iterator[str]:
     return table(HEADS, (row_of(name, seeds) for name in kinds))

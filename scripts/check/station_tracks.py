@@ -198,17 +198,19 @@ def _judge_groups(views: ObjectViews, seen: list[Detections | None], owners: lis
         sums.right += len(found) == 1 and -1 not in found
 
 
-@section("tracks.md", "station tracks", seeds=1, seconds=12.0, counts=(2,))
-def station_tracks(seeds: int = 8, seconds: float = 60.0, counts: tuple[int, ...] = (2, 3, 5)) -> Iterator[str]:
+@section("tracks.md", "station tracks", seeds=range(1), seconds=12.0, counts=(2,))
+def station_tracks(
+    seeds: range = range(8), seconds: float = 60.0, counts: tuple[int, ...] = (2, 3, 5)
+) -> Iterator[str]:
     yield (
         "12 targets (smokes, ships at 8 m/s, drones at 25 m/s) in 12 by 16 km, all of one category, once a second for "
-        f"{seconds:g} s, {seeds} draws; boxes {BOX_PX:g} px, {100 * MISSED:g} % missed, {FALSE:g} false an image; "
+        f"{seconds:g} s, {len(seeds)} draws; boxes {BOX_PX:g} px, {100 * MISSED:g} % missed, {FALSE:g} false an image; "
         f"attitude known to {ATTITUDE_DEG[0]}° and heading to {ATTITUDE_DEG[2]}°, clocks to {OFFSET_S} s and "
         f"{1e6 * RATE:g} ppm."
     )
     yield ""
     all_sums = [Sums() for _ in counts]
-    for seed, (count, each) in itertools.product(range(seeds), zip(counts, all_sums, strict=True)):
+    for seed, (count, each) in itertools.product(seeds, zip(counts, all_sums, strict=True)):
         run_seed(seed, count, seconds, each)
     rows = []
     for count, s in zip(counts, all_sums, strict=True):

@@ -245,11 +245,13 @@ def compare(
     figures.add(f"{kind}: followed", float(len(names)))
 
 
-@section("tracks.md", "tracks", seeds=1, seconds=4.0, clock_seeds=1, clock_seconds=3.0)
-def tracks(seeds: int = 4, seconds: float = 12.0, clock_seeds: int = 4, clock_seconds: float = 60.0) -> Iterator[str]:
+@section("tracks.md", "tracks", seeds=range(1), seconds=4.0, clock_seeds=1, clock_seconds=3.0)
+def tracks(
+    seeds: range = range(4), seconds: float = 12.0, clock_seeds: int = 4, clock_seconds: float = 60.0
+) -> Iterator[str]:
     """Seeds and seconds of the tracks, and of the runs of the clock."""
     figures = Figures()
-    for seed in range(seeds):
+    for seed in seeds:
         run_seed(seed, seconds, figures)
     for seed in range(clock_seeds):
         run_clock(100 + seed, clock_seconds, figures)
@@ -269,8 +271,8 @@ def tracks(seeds: int = 4, seconds: float = 12.0, clock_seeds: int = 4, clock_se
     lost = [5000.0 * 30.0 / 10.0 * ms / 1e3 for ms in (40.0, rms(offset))]
     yield (
         f"{TARGETS} targets from 100 m to 5 km, six of them at 5 km and 30 m/s; cameras of 10 and 25 frames a second; "
-        f"boxes {BEARING_PX} px, matching {MATCH_PX} px; relative yaw known to {YAW_SIGMA}°; {seconds:g} s, {seeds} "
-        "draws of rig, targets and noise."
+        f"boxes {BEARING_PX} px, matching {MATCH_PX} px; relative yaw known to {YAW_SIGMA}°; {seconds:g} s, "
+        f"{len(seeds)} draws of rig, targets and noise."
     )
     yield ""
     yield from table(

@@ -24,7 +24,7 @@ from kcal.texts import percent_text
 
 # Warnings about how views were taken: motion while rows were read, and images that were stretched.
 
-# Of fewer views that moved, 95 % ellipses contain the truth in 86 to 93 % (`scripts.check.captures_that_move`).
+# Of fewer views that moved, 95 % ellipses contain the truth in 86 to 93 % (`scripts/check/captures_that_move.py`).
 _FEW = 6
 # Views in which the board bends by so many times what is typical are named, if they are no more than this share.
 _BENT, _SOME, _NAMED = 2.0, 0.5, 5
