@@ -245,7 +245,7 @@ def detect_command(
 
     views = [view for one in observed for view in one.views]
     failures = [failure for one in observed for failure in one.failures]
-    found, unseen = len(views), sum(view.pixels.count(None) for view in views)
+    found, unseen = len(views), sum(int((~view.seen).sum()) for view in views)
     tell(views=found, failures={failure.name: failure.reason for failure in failures})
     for path, one in zip(outputs, observed, strict=True):
         width, height = one.image_size

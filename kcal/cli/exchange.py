@@ -149,7 +149,7 @@ def import_command(
         seen = import_corners(paths[0], kcal.Board.parse(board, square), size)
         seen.save(output)
         weights = "with weights" if seen.covariances() is not None else "without weights"
-        corners = sum(pixel is not None for view in seen.views for pixel in view.pixels)
+        corners = sum(int(view.seen.sum()) for view in seen.views)
         out.print(f"{len(seen.views)} views with {corners} corners, {weights}")
     elif what:
         _import_survey(paths[0], output, survey_sigma, geoid)

@@ -71,56 +71,33 @@ def board_fields(text: str, square: str) -> dict[str, Any]:
         raise InputError(f"board {text!r}: {2 // each} to {MOST // each} {what} each way are needed")
     side = length(square, "square")
     fields: dict[str, Any] = {"columns": each * columns, "rows": each * rows, "square": side}
-    if kind == "":
-        if more:
+    given: dict[str, Any] = {}
+    for part in more:
+        name, value = _said(kind, part, side, given)
+        if not name or name in given:
             raise InputError(form)
-    elif kind == "charuco":
-        fields |= _charuco_fields(more, side, form)
+        given[name] = value
+    usual: dict[str, Any] = {"pattern": kind} if kind not in ("", "charuco") else {}
+    if kind == "charuco":
+        usual = {"dictionary": _DEFAULT_DICTIONARY, "marker": _MARKER_SHARE * side}
     elif kind == "aprilgrid":
-        fields |= {"pattern": "aprilgrid"} | _april_fields(more, side, form)
-    else:
-        if len(more) > 1:
-            raise InputError(form)
-        fields |= {"pattern": kind} | ({"diameter": length(more[0], "diameter")} if more else {})
-    return fields
+        usual["gap"] = _SPACING * side
+    return fields | usual | given
 
 
-def _charuco_fields(parts: list[str], side: float, form: str) -> dict[str, Any]:
-    fields: dict[str, Any] = {}
-    for part in parts:
-        name = part.strip().lower().removeprefix("dict_")
-        if (first := _first_id(part)) is not None:
-            new: dict[str, Any] = {"first": first}
-        elif name in DICTIONARIES or (not fields and not re.match(r"[\d.]+\s*[a-z]+$", name)):
-            new = {"dictionary": name}
-        elif "marker" in fields:
-            raise InputError(form)
-        else:
-            new = {"marker": length(part, "marker")}
-        if new.keys() & fields.keys():
-            raise InputError(form)
-        fields |= new
-    return {"dictionary": _DEFAULT_DICTIONARY, "marker": _MARKER_SHARE * side} | fields
-
-
-def _april_fields(parts: list[str], side: float, form: str) -> dict[str, Any]:
-    fields: dict[str, Any] = {}
-    for part in parts:
-        if (first := _first_id(part)) is not None:
-            new: dict[str, Any] = {"first": first}
-        elif re.fullmatch(r"\s*\d*\.?\d+\s*", part):
-            new = {"gap": float(part) * side}
-        else:
-            new = {"gap": length(part, "spacing")}
-        if new.keys() & fields.keys():
-            raise InputError(form)
-        fields |= new
-    return {"gap": _SPACING * side} | fields
-
-
-def _first_id(text: str) -> int | None:
-    match = re.fullmatch(r"\s*id(\d{1,6})\s*", text, re.IGNORECASE)
-    return int(match.group(1)) if match else None
+def _said(kind: str, part: str, side: float, given: Mapping[str, Any]) -> tuple[str, Any]:
+    """Which field a part of a text says, and its value; no name where a board of this kind has no such part."""
+    name = part.strip().lower().removeprefix("dict_")
+    if kind in ("charuco", "aprilgrid") and (first := re.fullmatch(r"id(\d{1,6})", name)):
+        return "first", int(first[1])
+    if kind == "charuco" and (name in DICTIONARIES or (not given and not re.match(r"[\d.]+\s*[a-z]+$", name))):
+        return "dictionary", name
+    if kind == "aprilgrid" and re.fullmatch(r"\d*\.?\d+", name):
+        return "gap", float(name) * side
+    field = {"": "", "charuco": "marker", "aprilgrid": "gap"}.get(kind, "diameter")
+    if not field or field in given:
+        return "", None
+    return field, length(part, "spacing" if field == "gap" else field)
 
 
 # Read the target files of Kalibr (https://github.com/ethz-asl/kalibr, wiki page "Calibration targets").
@@ -150,21 +127,20 @@ def target_fields(path: str | Path) -> dict[str, Any]:
         raise FileError(f"{path}: not a target file of Kalibr: target_type is missing")
     kind = content["target_type"]
 
-    def number(name: str) -> float:
-        value = content.get(name)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e3:
-            raise FileError(f"{path}: {name} must be a positive number, it is {value!r:.40}")
-        return float(value)
-
-    def count(name: str) -> int:
-        value = content.get(name)
-        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 500:
-            raise FileError(f"{path}: {name} must be a whole number from 1 to 500, it is {value!r:.40}")
+    def stated(name: str, what: str, kinds: Any, low: float, high: float) -> Any:
+        value: Any = content.get(name)
+        if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
+            raise FileError(f"{path}: {name} must be {what}, it is {value!r:.40}")
         return value
 
+    def number(name: str) -> float:
+        return float(stated(name, "a positive number", (int, float), 1e-300, 1e3))
+
+    def count(name: str) -> int:
+        return int(stated(name, "a whole number from 1 to 500", int, 1, 500))
+
     if kind == "aprilgrid":
-        size = number("tagSize")
-        columns, rows = 2 * count("tagCols"), 2 * count("tagRows")
+        size, columns, rows = number("tagSize"), 2 * count("tagCols"), 2 * count("tagRows")
         gap = number("tagSpacing") * size
         return {"pattern": "aprilgrid", "columns": columns, "rows": rows, "square": size, "gap": gap}
     if kind not in ("checkerboard", "circlegrid"):
@@ -236,22 +212,15 @@ class Board(Record):
     first: int = pydantic.Field(default=0, ge=0)
 
     @pydantic.model_validator(mode="after")
-    def _markers(self) -> Board:
+    def _fits_pattern(self) -> Board:
         if (self.dictionary is None) != (self.marker is None):
             raise ValueError("a ChArUco board has a dictionary and a marker size, a checkerboard neither")
         if self.dictionary is not None and self.pattern != "checkerboard":
             raise ValueError("only a ChArUco board has a dictionary; the tags of an AprilGrid are 36h11")
-        if self.dictionary is None or self.marker is None:
-            return self
-        if self.dictionary not in DICTIONARIES:
+        if self.dictionary not in (None, *DICTIONARIES):
             raise ValueError(f"dictionary {self.dictionary!r}: choose one of {', '.join(DICTIONARIES)}")
-        self._refuse_few(self.dictionary)
-        if not self.marker < self.square:
+        if self.marker is not None and not self.marker < self.square:
             raise ValueError("a marker must be smaller than its square")
-        return self
-
-    @pydantic.model_validator(mode="after")
-    def _fits_pattern(self) -> Board:
         if (self.gap is None) == (self.pattern == "aprilgrid"):
             raise ValueError("an AprilGrid has a gap between its tags, other boards have none")
         if self.gap is not None:
@@ -259,18 +228,15 @@ class Board(Record):
                 raise ValueError("an AprilGrid has two points of each tag in a row and in a column")
             if not self.gap <= self.square:
                 raise ValueError("the gap between tags must not exceed their side")
-            self._refuse_few(TAGS)
+        if self.markers and self.first + self.markers > DICTIONARIES[dictionary := self.dictionary or TAGS]:
+            since = f" from number {self.first} on" if self.first else ""
+            raise ValueError(f"the board needs {self.markers} markers{since}, dictionary {dictionary} fewer")
         circles = self.pattern in ("circles", "asymmetric")
         if self.diameter is not None and not (circles and self.diameter < self.spacing):
             raise ValueError("only circles have a diameter, which is smaller than the distance of their centers")
         if self.first and not self.markers:
             raise ValueError("only a board with markers has a first number")
         return self
-
-    def _refuse_few(self, dictionary: str) -> None:
-        if self.first + self.markers > DICTIONARIES[dictionary]:
-            since = f" from number {self.first} on" if self.first else ""
-            raise ValueError(f"the board needs {self.markers} markers{since}, dictionary {dictionary} fewer")
 
     def _doubt(self) -> str:
         # Boards for drones have squares of a meter.

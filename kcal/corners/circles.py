@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +13,7 @@ from torch import Tensor
 from kcal.corners.board import Board
 from kcal.corners.images import Gray
 from kcal.corners.saddle import CornerStatus, Refined, with_status
+from kcal.corners.search import NotFoundError, in_new_thread, search_sizes, to_full_size
 from kcal.opencv import cv2
 
 # Fit the edge of a blurred dark or light ellipse: its center with covariance, its shape, its blur.
@@ -318,7 +317,6 @@ def _normalized(points: Tensor) -> tuple[Tensor, Tensor]:
 # and corrects the ellipse's center, which is not the image of the circle's center.
 # All circles must be in the image.
 
-SEARCH_SIDES = (1200, 2400)  # pixels: longer sides of the searched image, small first
 _MOST_REACH = 1.8  # radii from the center to where pixels tell of the edge and of the light outside
 _FOREIGN = 1.5  # pixels short of the next circle's edge, where its blur begins
 _MOST_BLUR = 0.5  # of the radius
@@ -329,29 +327,21 @@ _LEAST_KNOWN = 6  # circles: fewer good ones do not tell how the others are shif
 _LATTICE = 0.3  # of a distance: how near a blob beside the grid must be to where its next circle would be
 
 
-class FoundCircles(NamedTuple):
-    """A grid of circles in an image.
+def find_circles(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor, float]:
+    """OpenCV's centers (corners, 2) of a grid of dark circles on light, or of light ones on dark, in the board's order.
 
-    Args:
-        pixels: (corners, 2) OpenCV's centers in the board's order; None if none were found.
-        radius: meters, about.
-        reason: why none were found.
-    """
+    Second, the circles' radius, meters, about.
 
-    pixels: Tensor | None
-    radius: float = 0.0
-    reason: str = ""
-
-
-def find_circles(image: npt.NDArray[np.uint8], board: Board) -> FoundCircles:
-    """The centers of a grid of dark circles on light, or of light ones on dark.
+    Raises:
+        NotFoundError: there is no such grid.
 
     Example:
-        >>> find_circles(np.full((100, 100), 200, np.uint8), Board.parse("circles:7x6", "20mm")).reason
-        'no grid of 7x6 circles found'
+        >>> find_circles(np.full((100, 100), 200, np.uint8), Board.parse("circles:7x6", "20mm"))
+        Traceback (most recent call last):
+        kcal.corners.search.NotFoundError: no grid of 7x6 circles found
     """
     reason, most = f"no grid of {board.columns}x{board.rows} {_kind(board)} found", 0
-    for small, scale in _sizes(image):
+    for _, small, scale in search_sizes(image):
         for picture in (small, 255 - small):
             blobs = round_blobs(picture)
             most = max(most, len(blobs))
@@ -372,10 +362,10 @@ def find_circles(image: npt.NDArray[np.uint8], board: Board) -> FoundCircles:
             sizes = torch.tensor([blob.size for blob in blobs], dtype=torch.float64)[own]
             first = local_maps(board.points[:, :2], ordered).first
             radius = float((0.5 * sizes / torch.linalg.det(first).abs().sqrt()).median())
-            return FoundCircles((ordered + 0.5) * scale - 0.5, radius)
+            return to_full_size(ordered, scale), radius
     if reason.startswith("no grid") and most:
         reason += f" ({most} round blobs seen, {board.corners} are needed, all in the image)"
-    return FoundCircles(None, reason=reason)
+    raise NotFoundError(reason)
 
 
 def refine_circles(image: Gray, pixels: Tensor, board: Board, radius: float) -> tuple[Refined, float]:
@@ -458,19 +448,6 @@ def _kind(board: Board) -> str:
     return "asymmetric circles" if board.pattern == "asymmetric" else "circles"
 
 
-def _sizes(image: npt.NDArray[np.uint8]) -> Iterator[tuple[npt.NDArray[np.uint8], Tensor]]:
-    height, width = image.shape
-    tried: set[tuple[int, int]] = set()
-    for longest in SEARCH_SIDES:
-        factor = max(1.0, max(width, height) / longest)
-        size = round(width / factor), round(height / factor)
-        if size in tried:
-            return
-        tried.add(size)
-        small = image if factor == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        yield np.asarray(small, np.uint8), torch.tensor([width / size[0], height / size[1]], dtype=torch.float64)
-
-
 def round_blobs(image: npt.NDArray[np.uint8], circularity: float = 0.0) -> list[cv2.KeyPoint]:
     """Dark round spots of an image."""
     return list(_detector(image.size, circularity).detect(image))
@@ -491,11 +468,9 @@ def _detector(pixels: int, circularity: float = 0.0) -> cv2.SimpleBlobDetector:
 def _find_grid(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.pattern == "asymmetric" else cv2.CALIB_CB_SYMMETRIC_GRID
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
-        # In a new thread OpenCV's random numbers begin anew, so that the same image always gives the same grid.
-        with ThreadPoolExecutor(1) as fresh:
-            found, centers = fresh.submit(
-                cv2.findCirclesGrid, image, (board.columns, board.rows), None, flags, _detector(image.size)
-            ).result()
+        found, centers = in_new_thread(
+            cv2.findCirclesGrid, image, (board.columns, board.rows), None, flags, _detector(image.size)
+        )
         if found:
             return torch.from_numpy(np.asarray(centers, np.float64).reshape(-1, 2))
     return None

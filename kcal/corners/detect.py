@@ -46,7 +46,7 @@ from kcal.corners.recognize import (
 )
 from kcal.corners.refine import Refinement, refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
-from kcal.corners.search import SEARCH_SIDES, find_board, reduced, refine_through_sizes
+from kcal.corners.search import NotFoundError, find_board, refine_through_sizes, search_sizes
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
 from kcal.files import source_name
@@ -55,23 +55,15 @@ from kcal.texts import briefly
 
 # What the search for a board in one image gives.
 
+# What is wrong with a corner, and what to do.
 _STATUS_TEXTS = {
-    CornerStatus.OUTSIDE: "too near the image's edge",
-    CornerStatus.NO_SADDLE: "not a corner",
-    CornerStatus.MOVED: "moved too far",
-    CornerStatus.NOT_CONVERGED: "did not converge",
-    CornerStatus.SATURATED: "over- or underexposed",
-    CornerStatus.OCCLUDED: "covered or glaring",
-    CornerStatus.BLURRED: "too blurred",
-}
-_CURES = {
-    CornerStatus.OUTSIDE: "keep the whole board in the image",
-    CornerStatus.NO_SADDLE: "hold still and focus",
-    CornerStatus.MOVED: "hold still and focus",
-    CornerStatus.NOT_CONVERGED: "hold still, focus, and switch off the camera's sharpening",
-    CornerStatus.SATURATED: "expose less",
-    CornerStatus.OCCLUDED: "light more evenly, and keep hands off the squares",
-    CornerStatus.BLURRED: "focus, hold still or move closer",
+    CornerStatus.OUTSIDE: ("too near the image's edge", "keep the whole board in the image"),
+    CornerStatus.NO_SADDLE: ("not a corner", "hold still and focus"),
+    CornerStatus.MOVED: ("moved too far", "hold still and focus"),
+    CornerStatus.NOT_CONVERGED: ("did not converge", "hold still, focus, and switch off the camera's sharpening"),
+    CornerStatus.SATURATED: ("over- or underexposed", "expose less"),
+    CornerStatus.OCCLUDED: ("covered or glaring", "light more evenly, and keep hands off the squares"),
+    CornerStatus.BLURRED: ("too blurred", "focus, hold still or move closer"),
 }
 
 
@@ -99,9 +91,9 @@ def too_few(refined: Refined, found: int) -> str:
     """Why too few of the points found could be refined, and what to do."""
     good = int((refined.status == CornerStatus.GOOD).sum())
     counts = Counter(refined.status.tolist())
-    why = ", ".join(f"{counts[code]} {text}" for code, text in _STATUS_TEXTS.items() if counts[code])
-    worst = max(_CURES, key=lambda code: counts[code])
-    cure = f"; {_CURES[worst]}" if counts[worst] else ""
+    why = ", ".join(f"{counts[code]} {text}" for code, (text, _) in _STATUS_TEXTS.items() if counts[code])
+    worst = max(_STATUS_TEXTS, key=lambda code: counts[code])
+    cure = f"; {_STATUS_TEXTS[worst][1]}" if counts[worst] else ""
     return f"only {good} of {found} corners could be refined ({why}){cure}"
 
 
@@ -110,43 +102,32 @@ def too_few(refined: Refined, found: int) -> str:
 MIN_CIRCLES = 0.5  # share of the circles that must be fitted successfully
 
 
-def detect_target(image: Gray, board: Board, refine: Refinement) -> Detection:
-    """Find a board that is no plain checkerboard.
+def detect_marked(image: Gray, board: Board, refine: Refinement, legacy: bool | None = None) -> Detection:
+    """Find the visible corners of a ChArUco board or an AprilGrid.
+
+    Args:
+        image: (H, W).
+        board: with markers.
+        refine: see `kcal.corners.refine.refine_corners`.
+        legacy: the numbering of a ChArUco board where the image does not tell it.
 
     Raises:
-        InputError: a refinement that circles do not have.
+        NotFoundError: too few are seen, or could be refined.
     """
-    if board.pattern == "aprilgrid":
-        return _detect_tags(image, board, refine)
-    if board.pattern == "checkerboard":
-        return detect_charuco(image, board, refine)
-    return _detect_circles(image, board, refine)
-
-
-def detect_charuco(image: Gray, board: Board, refine: Refinement, legacy: bool | None = None) -> Detection:
-    """Find the visible corners of a ChArUco board; `legacy` is the numbering where the image does not tell it."""
-    pixels, reason, told = find_charuco(to_8bit(image), board, legacy)
-    if pixels is None:
-        return Detection(None, reason)
-    seen = torch.isfinite(pixels).all(-1)
-    refined = refine_corners(image, pixels, free_side(pixels, board), refine, (board.columns, board.rows))
-    if not enough(refined.pixels, board):
-        return Detection(None, too_few(refined, int(seen.sum())))
-    return Detection(refined.pixels, covariance=refined.covariance, legacy=told)
-
-
-def _detect_tags(image: Gray, board: Board, refine: Refinement) -> Detection:
-    found = find_aprilgrid(to_8bit(image), board)
-    if found.pixels is None:
-        return Detection(None, found.reason)
-    seen = torch.isfinite(found.pixels).all(-1)
-    refined = refine_corners(image, found.pixels, torch.where(seen, found.side, 1.0), refine)
+    tags, grid, told = board.pattern == "aprilgrid", None, None
+    if tags:
+        pixels, side = find_aprilgrid(to_8bit(image), board)
+    else:
+        pixels, told = find_charuco(to_8bit(image), board, legacy)
+        side, grid = free_side(pixels, board), (board.columns, board.rows)
+    seen = int(torch.isfinite(pixels).all(-1).sum())
+    refined = refine_corners(image, pixels, side, refine, grid)
     if not enough(refined.pixels, board):
         none = (CornerStatus.NO_SADDLE, CornerStatus.MOVED, CornerStatus.NOT_CONVERGED, CornerStatus.OCCLUDED)
-        lacking = sum(int((refined.status == status).sum()) for status in none) > 0.5 * int(seen.sum())
+        lacking = tags and sum(int((refined.status == status).sum()) for status in none) > 0.5 * seen
         more = "; the small squares between the tags are needed, as Kalibr draws them" if lacking else ""
-        return Detection(None, too_few(refined, int(seen.sum())) + more)
-    return Detection(refined.pixels, covariance=refined.covariance)
+        raise NotFoundError(too_few(refined, seen) + more)
+    return Detection(refined.pixels, covariance=refined.covariance, legacy=told)
 
 
 def _detect_circles(image: Gray, board: Board, refine: Refinement) -> Detection:
@@ -154,14 +135,13 @@ def _detect_circles(image: Gray, board: Board, refine: Refinement) -> Detection:
         raise InputError(
             f"refine {refine!r}: circles are fitted at their edges (erf), or left as OpenCV finds them (none)"
         )
-    found = find_circles(to_8bit(image), board)
-    if found.pixels is None or refine == "none":
-        return Detection(found.pixels, found.reason)
-    refined, radius = refine_circles(image, found.pixels, board, found.radius)
-    if (reason := wrong_size(board, radius)) or int(
-        (refined.status == CornerStatus.GOOD).sum()
-    ) < MIN_CIRCLES * board.corners:
-        return Detection(None, reason or too_few(refined, board.corners))
+    pixels, radius = find_circles(to_8bit(image), board)
+    if refine == "none":
+        return Detection(pixels)
+    refined, radius = refine_circles(image, pixels, board, radius)
+    good = int((refined.status == CornerStatus.GOOD).sum())
+    if (reason := wrong_size(board, radius)) or good < MIN_CIRCLES * board.corners:
+        raise NotFoundError(reason or too_few(refined, board.corners))
     return Detection(refined.pixels, covariance=refined.covariance)
 
 
@@ -189,8 +169,7 @@ def seen_by_most(failed: Sequence[tuple[Any, str]], board: Board) -> tuple[str, 
         text = size_advice((int(said[1]), int(said[2])), board) if said else ""
         if number < _LOOKS:
             with suppress(FileError):
-                image = to_8bit(image_and_hash(file)[0])
-                small = to_8bit(reduced(image, max(1.0, max(image.shape) / SEARCH_SIDES[0]), _size(image))[0])
+                _, small, _ = next(search_sizes(to_8bit(image_and_hash(file)[0])))
                 # Corners may also be seen between circles.
                 text = (seen_circles(small, board, clear=True) or text) if said else seen_instead(small, board)
         if text:
@@ -346,15 +325,20 @@ def detect_board(image: Gray | Tensor, board: Board, refine: Refinement = "erf")
         )
     if refine not in get_args(Refinement):
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
-    if board.pattern != "checkerboard" or board.dictionary is not None:
-        return detect_target(image, board, refine)
+    try:
+        if board.markers:
+            return detect_marked(image, board, refine)
+        if board.pattern != "checkerboard":
+            return _detect_circles(image, board, refine)
+    except NotFoundError as error:
+        return Detection(None, str(error))
     search = find_board(to_8bit(image), board)
     pixels = search.pixels
     if pixels is None:
         return Detection(None, search.reason, rejected=search.rejected)
     if refine != "none":
         pixels = refine_through_sizes(image, pixels, board, search.factor)
-    if sharpness(image, pixels, board.columns, board.rows) < MIN_SHARPNESS:
+    if sharpness(image, pixels.reshape(board.rows, board.columns, 2)) < MIN_SHARPNESS:
         blurred = "too blurred: edges are nearly as wide as the squares; focus, hold still or move closer"
         return Detection(None, blurred, rejected=pixels)
     side = local_side(pixels, board.columns, board.rows)
@@ -551,11 +535,11 @@ def _renumbered(
     unclear, out = set(numberings.get(None, ())), []
     for view in views:
         if view.name in unclear:
-            found = detect_charuco(image_and_hash(sources[view.name])[0], board, refine, legacy=True)
-            if found.pixels is not None:
+            with suppress(NotFoundError):
+                found = detect_marked(image_and_hash(sources[view.name])[0], board, refine, legacy=True)
                 out.append(view_of(found, view.name, image=view.image, sha256=view.sha256))
-            continue
-        out.append(view)
+        else:
+            out.append(view)
     return out
 
 
@@ -573,12 +557,10 @@ def view_of(found: Detection, name: str, image: str | None = None, sha256: str |
     """
     if found.pixels is None:
         raise InputError(f"{name}: {found.reason}")
-    pixels = tuple(None if u != u else (u, v) for u, v in found.pixels.tolist())
-    spread = None
+    corners: dict[str, Any] = {"pixels": found.pixels}
     if found.covariance is not None:
-        packed = found.covariance.reshape(-1, 4)[:, [0, 1, 3]].tolist()
-        spread = tuple(None if uu != uu else (uu, uv, vv) for uu, uv, vv in packed)
-    return View(name=name, pixels=pixels, covariance=spread, image=image, sha256=sha256)
+        corners["covariance"] = found.covariance.reshape(-1, 4)[:, [0, 1, 3]]
+    return View(name=name, image=image, sha256=sha256, **corners)
 
 
 def _size(image: Any) -> tuple[int, int]:

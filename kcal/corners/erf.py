@@ -400,16 +400,8 @@ def _with_gradient(parameters: Tensor, inputs: _FitInputs, levels: Tensor) -> Te
         far = torch.full((len(parameters), 2, 2, 1), FAR, dtype=torch.float64, device=parameters.device)
         lines = LineDistances(far, torch.zeros_like(far))
 
-    def gradient(
-        parameters: Tensor,
-        bend: Tensor,
-        distance: Tensor,
-        turn: Tensor,
-        prior: Tensor,
-        mean: Tensor,
-        weight: Tensor,
-        values: Tensor,
-    ) -> Tensor:
+    def gradient(parameters: Tensor, *given: Tensor) -> Tensor:
+        bend, distance, turn, prior, mean, weight, values = given
         levels, jacobian = crossing(parameters, window.where, bend, LineDistances(distance, turn))
         return jacobian @ (weight * (levels - values)) + prior * (parameters - mean)
 

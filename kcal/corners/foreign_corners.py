@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,9 @@ from kcal.files import read_bytes, read_text
 from kcal.strict_formats import read_mat, read_storage
 from kcal.strict_json import MOST_BYTES
 
-# (u, v, weight) of a corner, or None where it was not seen.
-Corner = tuple[float, float, float] | None
+# (u, v, weight) of a corner; NaN where it was not seen.
+Corner = tuple[float, float, float]
+_UNSEEN = (math.nan, math.nan, math.nan)
 
 
 def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] | None = None) -> Observations:
@@ -81,9 +82,16 @@ def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] |
     for name, corners in views.items():
         if len(corners) != board.corners:
             raise FileError(f"{path}: {name} has {len(corners)} corners, the board {board.corners}")
-    weighted = any(corner is not None and corner[2] != 1.0 for corners in views.values() for corner in corners)
+    # Arrays (N, 3), as `View` takes them.
+    shown: dict[str, Any] = {
+        name: array for name, corners in views.items() if np.isfinite(array := np.array(corners)).any()
+    }
+    weighted = any((array[np.isfinite(array[:, 2]), 2] != 1.0).any() for array in shown.values())
     try:
-        found = [_view(name, corners, weighted) for name, corners in views.items() if any(corners)]
+        found = [
+            View(name=name, pixels=array[:, :2], covariance=array[:, 2:] ** -2.0 * (1, 0, 1) if weighted else None)
+            for name, array in shown.items()
+        ]
         if not found:
             raise FileError(f"{path}: no view with corners")
         return Observations(board=board, image_size=size, refinement="none", views=tuple(found))
@@ -91,18 +99,9 @@ def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] |
         raise FileError(f"{path}: bad corners file: {error}") from error
 
 
-def _view(name: str, corners: Sequence[Corner], weighted: bool) -> View:
-    spread = tuple(None if corner is None else (corner[2] ** -2, 0.0, corner[2] ** -2) for corner in corners)
-    return View(
-        name=name,
-        pixels=tuple(None if corner is None else corner[:2] for corner in corners),
-        covariance=spread if weighted else None,
-    )
-
-
 def _corner_of_weight(u: str, v: str, weight: float, where: str) -> Corner:
     if u in ("", "-") or v in ("", "-") or not weight > 0:
-        return None
+        return _UNSEEN
     values = float(u), float(v), weight
     if not all(map(math.isfinite, values)):
         raise ValueError(f"{where}: {u}, {v}, {weight} are no finite numbers")
@@ -127,14 +126,14 @@ def _from_vnl(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
         corners = views.setdefault(fields[0], [])
         if fields[1] == "-":
             # An image without a board has a single line.
-            corners.append(None)
+            corners.append(_UNSEEN)
             continue
         last = fields[3] if len(fields) > 3 else "-"
         weight = 1.0 if last == "-" else float(last)
         if header[3:] == ["level"] and last != "-":
             weight = 0.0 if weight < 0 else 0.5**weight
         corners.append(_corner_of_weight(fields[1], fields[2], weight, where))
-    return {name: corners for name, corners in views.items() if corners != [None]}, None
+    return {name: corners for name, corners in views.items() if corners != [_UNSEEN]}, None
 
 
 def _from_csv(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
@@ -151,7 +150,7 @@ def _from_csv(path: Path, board: Board) -> tuple[dict[str, list[Corner]], None]:
         if None in row or None in row.values():
             raise ValueError(f"{where}: a wrong number of fields")
         corner = _corner_of_weight(row["u"], row["v"], float(row.get("weight") or 1.0), where)
-        corners = views.setdefault(row["image"], [None] * board.corners if numbered else [])
+        corners = views.setdefault(row["image"], [_UNSEEN] * board.corners if numbered else [])
         if not numbered:
             corners.append(corner)
             continue
@@ -191,7 +190,7 @@ def _whole_size(sides: Any) -> tuple[int, int]:
 def _unweighted(points: np.ndarray) -> dict[str, list[Corner]]:
     """Views named by their numbers; NaN where a corner was not seen."""
     return {
-        f"{number:03d}": [None if not np.isfinite(p).all() else (float(p[0]), float(p[1]), 1.0) for p in view]
+        f"{number:03d}": [(float(u), float(v), 1.0) if np.isfinite(u + v) else _UNSEEN for u, v in view]
         for number, view in enumerate(points, 1)
     }
 

@@ -58,12 +58,11 @@ def local_side(pixels: Tensor, columns: int, rows: int) -> Tensor:
     return side.reshape(-1)
 
 
-def cell_levels(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> Tensor:
-    """Mean gray level in the middle of each square between four corners, (rows - 1, columns - 1) float64.
+def cell_levels(image: npt.NDArray[np.generic], grid: Tensor) -> Tensor:
+    """Mean gray level in the middle of each square between four corners (rows, columns, 2): one less each way, float64.
 
     Sampled at 25 points over the middle half of the square, so that corners may be off by a few pixels.
     """
-    grid = as_grid(pixels, columns, rows)
     share = torch.linspace(0.25, 0.75, 5, dtype=torch.float64)
     b, a = torch.meshgrid(share, share, indexing="ij")
     a, b = a.reshape(-1, 1), b.reshape(-1, 1)
@@ -72,24 +71,23 @@ def cell_levels(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, ro
     return levels_at(image, top * (1 - b) + bottom * b).mean(-1)
 
 
-def first_square_dark(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> tuple[bool, float]:
-    """Whether the square diagonally outside corner 0 is dark, and the share of neighboring squares that agree.
+def first_square_dark(image: npt.NDArray[np.generic], grid: Tensor) -> tuple[bool, float]:
+    """Whether the square diagonally outside the first corner is dark, and the share of neighboring squares that agree.
 
     Colors alternate, so that square has the color of the first one inside.
     """
-    differences = _alternating(cell_levels(image, pixels, columns, rows))
+    differences = _alternating(cell_levels(image, grid))
     lighter = float((differences > 0).double().mean())
     return lighter > 0.5, max(lighter, float((differences < 0).double().mean()))
 
 
-def sharpness(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> float:
+def sharpness(image: npt.NDArray[np.generic], grid: Tensor) -> float:
     """Contrast near the corners of the squares over that in their middle: 1 if sharp, 0.5 if blurred to waves.
 
     The median over the squares, near meaning a quarter of a square inside. A Gaussian blur of 0.2 of the square's side
     gives 0.64, one of 0.25 gives 0.54. With more blur a corner is shifted by what lies beyond its four squares, by
     tenths of a pixel at the board's border.
     """
-    grid = as_grid(pixels, columns, rows)
     p, q, r, s = grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
     middle = levels_at(image, (p + q + r + s) / 4)
     near = torch.stack(
@@ -98,8 +96,8 @@ def sharpness(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows
             for a, b, c, d in ((p, q, r, s), (q, p, s, r), (r, s, p, q), (s, r, q, p))
         ]
     ).mean(0)
-    contrast = _alternating(middle).nanmedian()
-    return float(_alternating(near).nanmedian() / torch.where(contrast == 0, 1e-9, contrast))
+    whole = _alternating(middle).nanmedian()
+    return float(_alternating(near).nanmedian() / torch.where(whole == 0, 1e-9, whole))
 
 
 def _alternating(levels: Tensor) -> Tensor:
@@ -107,12 +105,16 @@ def _alternating(levels: Tensor) -> Tensor:
 
     Comparing neighbors makes the result nearly independent of uneven light.
     """
-    rows, columns = levels.shape
-    i, j = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
-    sign = 1.0 - 2.0 * ((i + j) % 2)
+    sign = checkered(levels)
     across = (levels[:, 1:] - levels[:, :-1]) * sign[:, :-1]
     down = (levels[1:] - levels[:-1]) * sign[:-1]
     return torch.cat([across.reshape(-1), down.reshape(-1)])
+
+
+def checkered(grid: Tensor) -> Tensor:
+    """1 and -1 in turn, for the places of a grid (rows, columns, ...)."""
+    i, j = torch.meshgrid(*map(torch.arange, grid.shape[:2]), indexing="ij")
+    return 1.0 - 2.0 * ((i + j) % 2)
 
 
 def levels_at(image: npt.NDArray[np.generic], where: Tensor) -> Tensor:
@@ -286,11 +288,11 @@ def grid_trouble(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, r
     trouble = uneven(image, grid)
     if trouble is not None:
         return trouble
-    if false_sides(image, pixels, columns, rows).any():
+    if false_sides(image, grid).any():
         return f"the outer line of {columns}x{rows} corners lies on the board's edge: the board has fewer inner corners"
-    if goes_on(image, pixels, columns, rows):
+    if goes_on(image, grid):
         return f"the squares go on beyond {columns}x{rows}: the board has more inner corners than that"
-    if skips(image, pixels, columns, rows):
+    if skips(image, grid):
         return f"lines of corners lie between those of {columns}x{rows}: the board has more inner corners than that"
     return None
 
@@ -305,42 +307,44 @@ def uneven(image: npt.NDArray[np.generic], grid: Tensor) -> str | None:
         bend < _LENS_BEND and ratio < _LENS_RATIO and _four_meet(image, grid)
     ):
         return "the grid found is uneven: not the board, or another number of corners"
-    rows, columns = grid.shape[:2]
-    if first_square_dark(image, grid.reshape(-1, 2), columns, rows)[1] < MIN_ALTERNATING:
+    if first_square_dark(image, grid)[1] < MIN_ALTERNATING:
         return "the squares of the grid found do not alternate between dark and light"
     return None
 
 
-def goes_on(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> bool:
+def goes_on(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
     """Whether the grid is only a part of a larger board.
 
     Detectors do return parts: asked for 8x6, OpenCV finds such a part on most views of a 9x6 board, and not the same
     part for each camera. One step beyond each side, four squares meet only if there is another row of corners; on the
     board's outer edge three of the four places have one color.
     """
-    grid = as_grid(pixels, columns, rows)
     return any(_goes_on_above(image, side) for side in sides(grid) if len(side) >= 3)
 
 
-def false_sides(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> Tensor:
+def false_sides(image: npt.NDArray[np.generic], grid: Tensor) -> Tensor:
     """Which sides of the grid are no lines of corners: top, bottom, left and right, (4,) bool.
 
     Asked for 9x6, OpenCV's sector detector takes the paper's edge of an 8x6 board for a ninth column where the ground
     is dark. Outside such a line squares do not alternate. A side that glare hides, or the image cuts, counts as true.
     """
-    grid = as_grid(pixels, columns, rows)
     return torch.tensor([_alternates_less_outside(image, side) for side in sides(grid)])
 
 
 def without_false_sides(image: npt.NDArray[np.generic], grid: Tensor) -> Tensor | None:
     """A grid (rows, columns, 2) without the outer lines that are no corners; None if fewer than 3 lines remain."""
     while min(grid.shape[:2]) >= 3:
-        rows, columns = grid.shape[:2]
-        top, bottom, left, right = (int(side) for side in false_sides(image, grid.reshape(-1, 2), columns, rows))
+        top, bottom, left, right = (int(side) for side in false_sides(image, grid))
         if not top + bottom + left + right:
             return grid
-        grid = grid[top : rows - bottom, left : columns - right]
+        grid = grid[top : len(grid) - bottom, left : grid.shape[1] - right]
     return None
+
+
+def sound_grid(image: npt.NDArray[np.generic], grid: Tensor) -> Tensor | None:
+    """A grid without such lines, if its squares alternate and it leaves out no line of a larger board."""
+    whole = without_false_sides(image, grid)
+    return None if whole is None or uneven(image, whole) is not None or skips(image, whole) else whole
 
 
 def _alternates_less_outside(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
@@ -367,13 +371,12 @@ def levels_beside(image: npt.NDArray[np.generic], places: Tensor, along: Tensor,
     return torch.stack([levels_at(image, places + share * (sign * along + down)).mean(-1) for sign in (1.0, -1.0)])
 
 
-def skips(image: npt.NDArray[np.generic], pixels: Tensor, columns: int, rows: int) -> bool:
+def skips(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
     """Whether the grid leaves out every other line of a larger board.
 
     Asked for 5x4, OpenCV finds every other row of a 9x6 board in some views; squares seen from the side look the same.
     In the middle of a square's side two colors meet; in the middle between corners that are two squares apart, four do.
     """
-    grid = as_grid(pixels, columns, rows)
     return any(_skips_rows(image, side) for side in (grid, grid.transpose(0, 1)))
 
 
@@ -381,26 +384,21 @@ def _skips_rows(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
     along = torch.gradient(grid, dim=1)[0]
     down = torch.gradient(grid, dim=0)[0]
     middle = 0.5 * (grid[1:] + grid[:-1])
-    between = _contrast(image, middle, 0.5 * (along[1:] + along[:-1]), 0.5 * (grid[1:] - grid[:-1]))
-    own = _contrast(image, grid, along, 0.5 * down)
+    between = contrast(image, middle, 0.5 * (along[1:] + along[:-1]), 0.5 * (grid[1:] - grid[:-1]))
+    own = contrast(image, grid, along, 0.5 * down)
     return float(between.abs().median() / own.abs().median().clamp_min(1e-9)) > _FOUR_COLORS
 
 
-def _contrast(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
+def contrast(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
     """Twice how much lighter two opposite quadrants around places (..., 2) are than the other two."""
-    share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
-    signs = ((1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0))
-    places, along, down = places[..., None, :], along[..., None, :], down[..., None, :]
-    parts = [sign * levels_at(image, places + share * (a * along + b * down)).mean(-1) for a, b, sign in signs]
-    return torch.stack(parts).sum(0)
+    return step_along(image, places, along, down) - step_along(image, places, along, -down)
 
 
 def _four_meet(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
     """Whether four squares meet at every corner of a grid (rows, columns, 2), in the order of a checkerboard."""
     along, down = torch.gradient(grid, dim=1)[0], torch.gradient(grid, dim=0)[0]
-    i, j = torch.meshgrid(*map(torch.arange, grid.shape[:2]), indexing="ij")
-    contrast = _contrast(image, grid, along, down) * (1.0 - 2.0 * ((i + j) % 2))
-    return float((contrast / contrast.median()).min()) > _FOUR_MEET
+    found = contrast(image, grid, along, down) * checkered(grid)
+    return float((found / found.median()).min()) > _FOUR_MEET
 
 
 def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
@@ -411,14 +409,14 @@ def _goes_on_above(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
     inside = in_image(image, beyond + 0.5 * out) & torch.isfinite(beyond + along).all(-1)
     if 2 * int(inside.sum()) < max(len(inside), 6):
         return False
-    own = _contrast(image, grid[0], along, (grid[0] - grid[1] + out) / 2)[inside]
+    own = contrast(image, grid[0], along, (grid[0] - grid[1] + out) / 2)[inside]
     own = torch.where(own.abs() < 1e-9, 1e-9, own)
     beyond, along, out = (each[inside, None] for each in (beyond, along, out))
     # Near a fisheye the next corners are up to a quarter of a square from there. No place on an outer edge has more
     # than half of a corner's contrast.
     step = torch.tensor([-0.24, -0.12, 0.0, 0.12, 0.24], dtype=torch.float64)
     a, b = (each[:, None] for each in torch.cartesian_prod(step, step).unbind(-1))
-    there = -_contrast(image, beyond + a * along + b * out, along, out) / own[:, None]
+    there = -contrast(image, beyond + a * along + b * out, along, out) / own[:, None]
     return float(there.amax(1).nanmedian()) > GOES_ON
 
 

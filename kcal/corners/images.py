@@ -484,8 +484,4 @@ def turned_images(paths: Sequence[str | Path]) -> list[Path]:
     Raises:
         FileError: a file that cannot be read.
     """
-    found = []
-    for path in map(Path, paths):
-        if exif_orientation(read_head(path, _EXIF_HEAD)) != 1:
-            found.append(path)
-    return found
+    return [path for path in map(Path, paths) if exif_orientation(read_head(path, _EXIF_HEAD)) != 1]

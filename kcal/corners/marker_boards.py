@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +14,7 @@ from kcal.corners.erf import SHARE
 from kcal.corners.grid import as_grid, local_side
 from kcal.corners.markers import opencv_dictionary
 from kcal.corners.saddle import CornerStatus, inside_image, saddle
-from kcal.corners.search import filled_grid
+from kcal.corners.search import NotFoundError, filled_grid
 from kcal.errors import InputError
 from kcal.opencv import cv2
 
@@ -25,8 +24,10 @@ _NEIGHBORS = 4  # markers that tell where one should be: few, because lenses ben
 _TRIES = 60  # pairs; nearly all of a board's markers agree, or hardly any
 
 
-def agreeing(placed: npt.NDArray[np.floating], seen: npt.NDArray[np.floating], tolerance: float) -> int:
-    """How many markers lie within `tolerance` of where one homography puts them.
+def inliers(
+    placed: npt.NDArray[np.floating], seen: npt.NDArray[np.floating], tolerance: float
+) -> npt.NDArray[np.bool_]:
+    """Which markers (M,) lie within `tolerance` of where one homography puts them.
 
     The homography is that of the two markers, near each other or not, with which most of the others agree; a wide lens
     bends the board, so that not all of it follows one.
@@ -39,18 +40,9 @@ def agreeing(placed: npt.NDArray[np.floating], seen: npt.NDArray[np.floating], t
     Example:
         >>> square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
         >>> placed = np.stack([square, square + [2, 0], square + [0, 2], square + [2, 2]])
-        >>> agreeing(placed, 10 * placed + 5, 0.1)
-        4
-        >>> agreeing(placed[[0, 1, 3, 2]], 10 * placed + 5, 0.1)
-        2
+        >>> inliers(placed, 10 * placed + 5, 0.1).sum(), inliers(placed[[0, 1, 3, 2]], 10 * placed + 5, 0.1).sum()
+        (np.int64(4), np.int64(2))
     """
-    return int(inliers(placed, seen, tolerance).sum())
-
-
-def inliers(
-    placed: npt.NDArray[np.floating], seen: npt.NDArray[np.floating], tolerance: float
-) -> npt.NDArray[np.bool_]:
-    """Which markers `agreeing` counts, (M,)."""
     if len(placed) < 2:
         return np.ones(len(placed), bool)
     pairs = np.stack(np.triu_indices(len(placed), 1), 1)
@@ -132,25 +124,11 @@ MOST_ENLARGED = 3_000_000  # pixels: larger images are not searched twice
 Markers = dict[int, npt.NDArray[np.float64]]  # the corners (4, 2) of each
 
 
-class FoundCharuco(NamedTuple):
-    """A ChArUco board in an image.
+def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None = None) -> tuple[Tensor, bool | None]:
+    """The corners of a ChArUco board: (corners, 2) in the board's order, NaN where not seen.
 
-    Args:
-        pixels: (corners, 2) in the board's order, NaN where not seen; None if too few are.
-        reason: why.
-        legacy: whether the numbering is that of OpenCV before 4.6; None where both are the same or too little is seen
-            to tell.
-    """
-
-    pixels: Tensor | None
-    reason: str = ""
-    legacy: bool | None = None
-
-
-def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None = None) -> FoundCharuco:
-    """The corners of a ChArUco board.
-
-    At least 6 corners are needed, two each on two rows and on two columns, so that they determine a pose.
+    Second, whether its numbering is that of OpenCV before 4.6; None where both are the same or too little is seen to
+    tell. At least 6 corners are needed, two each on two rows and on two columns, so that they determine a pose.
 
     Args:
         image: (H, W).
@@ -159,6 +137,7 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
 
     Raises:
         InputError: the board has no markers.
+        NotFoundError: too few corners are seen.
     """
     if board.dictionary is None:
         raise InputError(f"{board}: not a ChArUco board")
@@ -170,8 +149,8 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
     own = _single(found)
     twice = sorted(found.keys() - own)
     if twice:
-        return FoundCharuco(
-            None, f"marker {twice[0]} is seen twice: two boards need different numbers (:idFIRST), or hide one of them"
+        raise NotFoundError(
+            f"marker {twice[0]} is seen twice: two boards need different numbers (:idFIRST), or hide one of them"
         )
     seen = own
     if len(own) < FEW * board.markers:
@@ -183,8 +162,7 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
     if board.rows % 2 and len(seen) >= _MIN_MARKERS:
         several = min(len(today.keys() - before), len(before.keys() - today)) >= _MIN_MARKERS
         if several and len(today | before) >= _MOST * len(seen):
-            return FoundCharuco(
-                None,
+            raise NotFoundError(
                 f"{len(today.keys() - before)} markers lie as on boards of today only, "
                 f"{len(before.keys() - today)} as on those of OpenCV before 4.6 only: two boards; hide one",
             )
@@ -196,14 +174,14 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
     if sure >= _MIN_FITTING * len(own) and (sure >= _MIN_MARKERS or len(markers) >= _MIN_UNSURE):
         pixels = _between(image, markers, board, old)
         if enough(pixels, board):
-            return FoundCharuco(pixels, legacy=told)
+            return pixels, told
     reason = f"fewer than {MIN_CORNERS} corners of the ChArUco board found, or all on one line"
     fitting = max(len(placed.keys() & own) for placed in (today, before))
     if len(own) >= _MIN_MARKERS and fitting < _MIN_FITTING * len(own):
         reason = "the markers do not lie as on this board: check its columns, rows, dictionary and first number"
     elif not own and (others := read_markers(image, board, board.dictionary, others=True)):
         reason += f"; markers {min(others)} to {max(others)} of {board.dictionary} are another board's"
-    return FoundCharuco(None, reason)
+    raise NotFoundError(reason)
 
 
 def read_markers(
@@ -348,70 +326,61 @@ _MIN_SEEN = 3, 2  # corners that must be where its neighbors put them: of a tag 
 _TURNS = (2, 0, 1, 3)
 
 
-class FoundTags(NamedTuple):
-    """An AprilGrid in an image.
+def find_aprilgrid(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor, Tensor]:
+    """The corners of an AprilGrid's tags, (corners, 2) to about a pixel in the board's order, NaN where not seen.
 
-    Args:
-        pixels: (corners, 2) in the board's order to about a pixel, NaN where not seen; None if too few are.
-        side: (corners,) the side of squares to pass to refinement, so that its window contains nothing else.
-        reason: why too few were found.
-    """
+    Second, the side (corners,) of squares to pass to refinement, so that its window contains nothing else; 1 where not
+    seen.
 
-    pixels: Tensor | None
-    side: Tensor
-    reason: str = ""
-
-
-def find_aprilgrid(image: npt.NDArray[np.uint8], board: Board) -> FoundTags:
-    """The corners of an AprilGrid's tags; two tags at least.
+    Raises:
+        NotFoundError: fewer than two tags are seen, or not those of the board.
 
     Example:
-        >>> find_aprilgrid(np.full((100, 100), 200, np.uint8), Board.parse("aprilgrid:6x6", "25mm")).reason
-        'fewer than 2 tags of the AprilGrid found'
+        >>> find_aprilgrid(np.full((100, 100), 200, np.uint8), Board.parse("aprilgrid:6x6", "25mm"))
+        Traceback (most recent call last):
+        kcal.corners.search.NotFoundError: fewer than 2 tags of the AprilGrid found
     """
     assert board.gap is not None
-    nothing = torch.full((board.corners,), float("nan"), dtype=torch.float64)
     border, tags = _most_tags(image, board)
     if not tags and (others := [n for size in BORDERS for n in read_markers(image, board, TAGS, size, others=True)]):
-        return FoundTags(
-            None,
-            nothing,
+        raise NotFoundError(
             f"tags {min(others)} to {max(others)} are seen, the board has {board.first} to "
             f"{board.first + board.markers - 1}: another board, or give its first number (:idFIRST)",
         )
     twice = [number for number, found in tags.items() if len(found) > 1]
     if twice:
-        return FoundTags(
-            None, nothing, f"tag {twice[0]} is seen twice: two boards need different numbers (:idFIRST), or hide one"
-        )
+        raise NotFoundError(f"tag {twice[0]} is seen twice: two boards need different numbers (:idFIRST), or hide one")
     if len(tags) < 2:
-        return FoundTags(None, nothing, "fewer than 2 tags of the AprilGrid found")
+        raise NotFoundError("fewer than 2 tags of the AprilGrid found")
     seen = {number: found[0] for number, found in tags.items()}
-    counts = {turn: _agreement(seen, board, turn) for turn in _TURNS}
+    found, tolerance = np.stack(list(seen.values())), _TAG_TOLERANCE * board.square
+    places = {turn: _tag_corners(board, turn) for turn in _TURNS}
+    counts = {
+        turn: int(inliers(np.stack([own[number] for number in seen]), found, tolerance).sum())
+        for turn, own in places.items()
+    }
     turn = max(_TURNS, key=lambda turn: counts[turn])
-    placed = _in_place(seen, board, turn)
+    placed = _in_place(seen, places[turn], tolerance)
     # Two tags agree with any place of them that only shifts and scales; a third must as well.
     if counts[turn] < min(3, len(seen)) or 2 * len(placed) < len(seen):
-        return FoundTags(
-            None,
-            nothing,
+        raise NotFoundError(
             f"the {len(seen)} tags found do not lie as on this board: check how many it has in a row; numbers must "
             "grow to the right and upward from the lower left",
         )
     pixels = torch.full((board.corners, 2), float("nan"), dtype=torch.float64)
-    side = nothing.clone()
+    side = torch.ones(board.corners, dtype=torch.float64)
     share = _FREE_SHARE / SHARE * min(math.sqrt(2.0) * border / (_CELLS + 2 * border), board.gap / board.square)
-    for number, corners in _with_unread(image, placed, board, turn, share).items():
-        places = _tag_places(number, board, turn)
+    for number, corners in _with_unread(image, placed, board, places[turn], share).items():
+        rows = _tag_places(number, board, turn)
         edge = float(np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1).min())
         moved = torch.from_numpy(nearer(image, corners, edge))
         # Corners whose window leaves the image would spoil what the others tell of the light.
         inside = inside_image(moved, torch.full((4,), SHARE * share * edge), image.shape[1], image.shape[0])
-        pixels[places] = torch.where(inside[:, None], moved, torch.nan)
-        side[places] = share * edge
+        pixels[rows] = torch.where(inside[:, None], moved, torch.nan)
+        side[rows] = share * edge
     if not enough(pixels, board):
-        return FoundTags(None, nothing, f"fewer than {MIN_CORNERS} corners of the AprilGrid's tags found")
-    return FoundTags(pixels, side)
+        raise NotFoundError(f"fewer than {MIN_CORNERS} corners of the AprilGrid's tags found")
+    return pixels, torch.where(torch.isfinite(pixels).all(-1), side, 1.0)
 
 
 def _most_tags(image: npt.NDArray[np.uint8], board: Board) -> tuple[int, dict[int, list[npt.NDArray[np.float64]]]]:
@@ -446,29 +415,27 @@ def _tag_places(number: int, board: Board, turn: int) -> list[int]:
     return around[turn:] + around[:turn]
 
 
-def _agreement(seen: dict[int, npt.NDArray[np.float64]], board: Board, turn: int) -> int:
-    points = board.points[:, :2].numpy()
-    placed = np.stack([points[_tag_places(number, board, turn)] for number in seen])
-    return agreeing(placed, np.stack(list(seen.values())), _TAG_TOLERANCE * board.square)
+def _tag_corners(board: Board, turn: int) -> Markers:
+    """The corners of all tags on the board."""
+    points, numbers = board.points[:, :2].numpy(), range(board.first, board.first + board.markers)
+    return {number: points[_tag_places(number, board, turn)] for number in numbers}
 
 
-def _in_place(seen: dict[int, npt.NDArray[np.float64]], board: Board, turn: int) -> dict[int, npt.NDArray[np.float64]]:
+def _in_place(seen: Markers, places: Markers, tolerance: float) -> Markers:
     """Those tags that lie where the tags next to them put them."""
-    points = board.points[:, :2].numpy()
     kept = {}
     for number, corners in seen.items():
         near = sorted(
             (other for other in seen if other != number),
             key=lambda other: float(np.linalg.norm(seen[other].mean(0) - corners.mean(0))),
         )[:_NEIGHBORS]
-        own = points[_tag_places(number, board, turn)]
-        placed = np.stack([points[_tag_places(other, board, turn)] for other in near])
+        own, placed = places[number], np.stack([places[other] for other in near])
         around = np.stack([seen[other] for other in near])
         board_from_image = board_homography(placed.reshape(-1, 2), around.reshape(-1, 2))
         if board_from_image is None:
             continue
         there = cv2.perspectiveTransform(corners[None], board_from_image)[0]
-        if np.linalg.norm(there - own, axis=1).mean() > _TAG_TOLERANCE * board.square:
+        if np.linalg.norm(there - own, axis=1).mean() > tolerance:
             continue
         # OpenCV finds tags too small by up to 4 px at each corner; their neighbors correct that.
         both = board_homography(
@@ -478,17 +445,17 @@ def _in_place(seen: dict[int, npt.NDArray[np.float64]], board: Board, turn: int)
     return kept
 
 
-def _with_unread(image: npt.NDArray[np.uint8], placed: Markers, board: Board, turn: int, share: float) -> Markers:
+def _with_unread(image: npt.NDArray[np.uint8], placed: Markers, board: Board, places: Markers, share: float) -> Markers:
     """Tags, and those that were not read but have corners where the tags beside them put them.
 
     Args:
         image: (H, W).
         placed: tags by number.
         board: an AprilGrid.
-        turn: of the tags.
+        places: corners of all tags on the board.
         share: of a tag's edge, the side to pass to refinement.
     """
-    points, light = board.points[:, :2].numpy(), torch.from_numpy(image)
+    light = torch.from_numpy(image)
     cells = {board.first + n: np.array(divmod(n, board.columns // 2)) for n in range(board.markers)}
     tags = dict(placed)
     while True:
@@ -499,12 +466,10 @@ def _with_unread(image: npt.NDArray[np.uint8], placed: Markers, board: Board, tu
             if away[near[0]] > 1:
                 continue
             board_from_image = board_homography(
-                np.concatenate([points[_tag_places(other, board, turn)] for other in near]),
-                np.concatenate([tags[other] for other in near]),
+                np.concatenate([places[other] for other in near]), np.concatenate([tags[other] for other in near])
             )
             if board_from_image is not None:
-                own = points[_tag_places(number, board, turn)]
-                guessed[number] = cv2.perspectiveTransform(own[None], np.linalg.inv(board_from_image))[0]
+                guessed[number] = cv2.perspectiveTransform(places[number][None], np.linalg.inv(board_from_image))[0]
         if not guessed:
             return tags
         starts = torch.from_numpy(np.stack(list(guessed.values())))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
+import numpy as np
 import pydantic
+from numpy.typing import NDArray
 
 from kcal.arrow import ArrowRows, arrow_table
 from kcal.corners.board import Board
@@ -49,13 +52,29 @@ class View(Record):
     image: str | None = None
     sha256: str | None = None
 
+    @property
+    def places(self) -> NDArray[np.float64]:
+        """(N, 2) pixels; NaN where a corner was not seen."""
+        return _rows(self.pixels, 2)
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(N,) which corners were seen."""
+        return np.array([pixel is not None for pixel in self.pixels], dtype=bool)
+
     def keeping(self, kept: Sequence[bool]) -> View:
         """A copy of the view in which corners that are not kept are None."""
-        pixels = tuple(value if own else None for value, own in zip(self.pixels, kept, strict=True))
-        spread = self.covariance
-        if spread is not None:
-            spread = tuple(value if own else None for value, own in zip(spread, kept, strict=True))
-        return self.model_copy(update={"pixels": pixels, "covariance": spread})
+
+        def of(values: tuple[Any, ...]) -> tuple[Any, ...]:
+            return tuple(value if own else None for value, own in zip(values, kept, strict=True))
+
+        spread = self.covariance and of(self.covariance)
+        return self.model_copy(update={"pixels": of(self.pixels), "covariance": spread})
+
+
+def _rows(values: Sequence[tuple[float, ...] | None], size: int) -> NDArray[np.float64]:
+    """(N, size) of the rows; NaN where there is none."""
+    return np.array([(math.nan,) * size if row is None else row for row in values]).reshape(-1, size)
 
 
 class Failure(Record):
@@ -107,18 +126,18 @@ class Observations(ArrowRows, NativeFile):
                 continue
             if len(view.covariance) != len(view.pixels):
                 raise ValueError(f"view {view.name!r} has {len(view.covariance)} covariances for its corners")
-            for pixel, spread in zip(view.pixels, view.covariance, strict=True):
-                if (pixel is None) != (spread is None):
-                    raise ValueError(f"view {view.name!r}: seen corners, and only these, must have a covariance")
-                if spread is not None and not (spread[0] > 0 and spread[0] * spread[2] > spread[1] ** 2):
+            if [spread is not None for spread in view.covariance] != view.seen.tolist():
+                raise ValueError(f"view {view.name!r}: seen corners, and only these, must have a covariance")
+            for spread in filter(None, view.covariance):
+                if not (spread[0] > 0 and spread[0] * spread[2] > spread[1] ** 2):
                     raise ValueError(f"view {view.name!r}: the covariance {spread} is not positive definite")
         return self
 
     def _refuse_outside(self, view: View) -> None:
         width, height = self.image_size
-        low, right, bottom = -0.5 - _BEYOND, width - 0.5 + _BEYOND, height - 0.5 + _BEYOND
-        out = [pixel for pixel in view.pixels if pixel and not (low <= pixel[0] <= right and low <= pixel[1] <= bottom)]
-        if out:
+        places, far = view.places, np.array(self.image_size) - 0.5 + _BEYOND
+        out = places[((places < -0.5 - _BEYOND) | (places > far)).any(1)]
+        if len(out):
             raise ValueError(
                 f"view {view.name!r}: {len(out)} corner(s) lie outside the image of {width}x{height} px, one at "
                 f"({out[0][0]:.1f}, {out[0][1]:.1f}): the image size or the corners are wrong, or of another scale"
@@ -139,11 +158,7 @@ class Observations(ArrowRows, NativeFile):
             raise InputError("no view with a board; check the board's size and the images")
         import torch
 
-        nowhere = (float("nan"), float("nan"))
-        return torch.tensor(
-            [[nowhere if pixel is None else pixel for pixel in view.pixels] for view in self.views],
-            dtype=torch.float64,
-        )
+        return torch.from_numpy(np.stack([view.places for view in self.views]))
 
     def covariances(self) -> Tensor | None:
         """Covariances as (views, corners, 2, 2) px²; NaN where not seen, None unless all views have them."""
@@ -151,10 +166,7 @@ class Observations(ArrowRows, NativeFile):
             return None
         import torch
 
-        nothing = (float("nan"),) * 3
-        packed = torch.tensor(
-            [[spread or nothing for spread in view.covariance or ()] for view in self.views], dtype=torch.float64
-        )
+        packed = torch.from_numpy(np.stack([_rows(view.covariance or (), 3) for view in self.views]))
         return packed[..., [0, 1, 1, 2]].unflatten(-1, (2, 2))
 
     def to_arrow(self, **more: Tensor) -> Any:
@@ -315,11 +327,9 @@ def rescaled(view: View, scale: tuple[float, float]) -> View:
         ((1.0, 1.0), None)
     """
     x, y = scale
-    pixels = tuple(at and ((at[0] + 0.5) * x - 0.5, (at[1] + 0.5) * y - 0.5) for at in view.pixels)
-    spread = view.covariance
-    if spread is not None:
-        spread = tuple(own and (own[0] * x * x, own[1] * x * y, own[2] * y * y) for own in spread)
-    return view.model_copy(update={"pixels": pixels, "covariance": spread})
+    spread = None if view.covariance is None else _rows(view.covariance, 3) * (x * x, x * y, y * y)
+    content = dict(view) | {"pixels": (view.places + 0.5) * scale - 0.5, "covariance": spread}
+    return View(**content)
 
 
 def _named(names: Sequence[str], group: Sequence[int]) -> str:

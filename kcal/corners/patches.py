@@ -145,6 +145,12 @@ def sample(windows: ImageWindows, pixels: Tensor, *, saturated: bool = False) ->
     return found.reshape(pixels.shape[:-1])
 
 
+def slopes_of(values: Tensor) -> Tensor:
+    """(N, h, w, ..., 2) half the change of values (N, h + 2, w + 2, ...) from neighbor to neighbor, across and down."""
+    across, down = values[:, 1:-1, 2:] - values[:, 1:-1, :-2], values[:, 2:, 1:-1] - values[:, :-2, 1:-1]
+    return 0.5 * torch.stack([across, down], -1)
+
+
 def has_samples(windows: ImageWindows, pixels: Tensor) -> Tensor:
     """(N, ...) where a sample and its slope are of the image and in the window, not of a repeated edge."""
     margin = 2.0**windows.level
@@ -429,12 +435,7 @@ def _covariance(
     count, height, width = patches.template.shape
     template = patches.template
     padded = torch.nn.functional.pad(template[:, None], (1,) * 4, mode="replicate")[:, 0]
-    own = (
-        torch.stack(
-            [0.5 * (padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2]), 0.5 * (padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1])], -1
-        ).flatten(1, 2)
-        * theta[:, 2, None, None]
-    )
+    own = slopes_of(padded).flatten(1, 2) * theta[:, 2, None, None]
     total = robust.sum(1).clamp_min(1e-12)
     # Free of contrast and brightness.
     flat = torch.stack([template.flatten(1), torch.ones_like(residual)], -1)

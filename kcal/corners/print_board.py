@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import escape
@@ -28,8 +26,7 @@ _BEZIER = 0.5522847498  # 4 (√2 - 1) / 3: a cubic with this handle is closest 
 _FONTS = "Helvetica, Arial, sans-serif"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rectangle:
+class Rectangle(NamedTuple):
     """A filled black rectangle; millimeters from the page's top left corner."""
 
     x: float
@@ -38,8 +35,7 @@ class Rectangle:
     height: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class Circle:
+class Circle(NamedTuple):
     """A filled black circle; its center in millimeters from the page's top left corner."""
 
     x: float
@@ -47,8 +43,7 @@ class Circle:
     diameter: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class Text:
+class Text(NamedTuple):
     """A line of text whose baseline begins at (x, y) millimeters from the top left corner."""
 
     x: float
@@ -57,8 +52,7 @@ class Text:
     text: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class Drawing:
+class Drawing(NamedTuple):
     """A page and what is on it, in millimeters."""
 
     width: float
@@ -361,8 +355,8 @@ def board_sheet(board: Board, page: str = "auto") -> Sheet:
         width=page_wide,
         height=page_high,
         title=f"Board {board}",
-        rectangles=tuple(dataclasses.replace(r, x=left + r.x, y=top + r.y) for r in pattern.rectangles) + ruler,
-        circles=tuple(dataclasses.replace(c, x=left + c.x, y=top + c.y) for c in pattern.circles),
+        rectangles=tuple(r._replace(x=left + r.x, y=top + r.y) for r in pattern.rectangles) + ruler,
+        circles=tuple(c._replace(x=left + c.x, y=top + c.y) for c in pattern.circles),
         texts=texts,
     )
     origin = (left + pattern.origin[0], top + pattern.origin[1])

@@ -13,10 +13,10 @@ import torch
 
 from kcal.corners.board import DICTIONARIES, TAGS, Board
 from kcal.corners.circles import round_blobs
-from kcal.corners.grid import goes_on, skips, uneven, without_false_sides
+from kcal.corners.grid import goes_on, sound_grid
 from kcal.corners.marker_boards import BORDERS, nearer
 from kcal.corners.markers import opencv_dictionary
-from kcal.corners.search import MIN_FILLED, SEARCH_SIDES, board_ends, grown_grid, reduced, seeds
+from kcal.corners.search import MIN_FILLED, board_ends, grown_grid, search_sizes, seeds
 from kcal.errors import InputError
 from kcal.opencv import cv2
 
@@ -293,19 +293,13 @@ def checkerboard(image: npt.NDArray[np.uint8]) -> SeenBoard | None:
     for number, grid in enumerate(seeds(image)):
         if number >= _SEEDS and best is not None:
             break
-        whole = without_false_sides(image, grid)
-        if whole is None or uneven(image, whole) is not None:
-            continue
-        if skips(image, whole.reshape(-1, 2), whole.shape[1], whole.shape[0]):
+        whole = sound_grid(image, grid)
+        if whole is None:
             continue
         grown = grown_grid(image, whole, _MOST_ACROSS)
         known = torch.isfinite(grown).all(-1)
         few, many = sorted(grown.shape[:2])
-        if (
-            few < 3
-            or float(known.double().mean()) < MIN_FILLED
-            or goes_on(image, grown.reshape(-1, 2), *grown.shape[1::-1])
-        ):
+        if few < 3 or float(known.double().mean()) < MIN_FILLED or goes_on(image, grown):
             continue
         seen = SeenBoard("", many, (0, few), sure=all(board_ends(image, grown)))
         if seen.sure:
@@ -414,8 +408,7 @@ def seen_board(image: npt.NDArray[np.uint8], without_markers: bool = False) -> S
         >>> seen.columns, seen.rows
         (5, (0, 3))
     """
-    factor = max(1.0, max(image.shape) / SEARCH_SIDES[0])
-    image = np.asarray(reduced(image, factor, (image.shape[1], image.shape[0]))[0], np.uint8)
+    _, image, _ = next(search_sizes(image))
     if not without_markers:
         marked = most_markers(image)
         if not marked.corners:

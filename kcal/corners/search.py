@@ -17,6 +17,8 @@ from kcal.corners.grid import (
     MIN_OUTER,
     MIN_SQUARE,
     as_grid,
+    checkered,
+    contrast,
     first_square_dark,
     goes_on,
     grid_trouble,
@@ -24,15 +26,19 @@ from kcal.corners.grid import (
     levels_beside,
     local_side,
     sides,
-    skips,
+    sound_grid,
     step_along,
-    uneven,
-    without_false_sides,
 )
 from kcal.corners.images import Gray
 from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import CornerStatus, saddle
+from kcal.errors import KcalError
 from kcal.opencv import cv2
+
+
+class NotFoundError(KcalError):
+    """Why an image does not show a board, in words that a person can act on."""
+
 
 # Put detected corners into the board's order, however the board was held.
 
@@ -72,7 +78,7 @@ def canonical_order(image: npt.NDArray[np.generic], pixels: Tensor, board: Board
     if board.columns == board.rows:
         quarter = grid.transpose(0, 1).flip(1)
         turns += [quarter, quarter.flip(0, 1)]
-    dark = [turn for turn in turns if first_square_dark(image, turn.reshape(-1, 2), board.columns, board.rows)[0]]
+    dark = [turn for turn in turns if first_square_dark(image, turn)[0]]
     return max(dark or turns, key=uprightness).reshape(-1, 2)
 
 
@@ -176,12 +182,6 @@ def _predicted(grid: Tensor) -> Tensor:
     return torch.where(torch.isfinite(curved), curved, straight)
 
 
-def checkered(grid: Tensor) -> Tensor:
-    """1 and -1 in turn, (rows, columns)."""
-    i, j = torch.meshgrid(torch.arange(grid.shape[0]), torch.arange(grid.shape[1]), indexing="ij")
-    return 1.0 - 2.0 * ((i + j) % 2)
-
-
 def _are_corners(
     image: npt.NDArray[np.generic],
     grid: Tensor,
@@ -192,9 +192,7 @@ def _are_corners(
     free: float,
 ) -> Tensor:
     """Whether squares alternate on all four sides of new places (N, 2), in step with the corners known in `grid`."""
-    own_along, own_down = (free * step for step in local_steps(grid))
-    known = (step_along(image, grid, own_along, own_down) - step_along(image, grid, own_along, -own_down)) / 2
-    known = known * checkered(grid)
+    known = contrast(image, grid, *(free * step for step in local_steps(grid))) / 2 * checkered(grid)
     around = torch.nn.functional.pad(known, (2, 2, 2, 2), value=torch.nan)
     near = [around[i : i + known.shape[0], j : j + known.shape[1]] for i in range(5) for j in range(5)]
     typical = torch.stack(near).nanmedian(0).values[new] * checkered(grid)[new]
@@ -222,25 +220,28 @@ MIN_END, MIN_END_SHARE = 3, 0.8  # corners that must show the board's end on one
 OUTER_SQUARE = 0.5  # of its contrast at the corner that the outer square must have up to the board's end
 
 
-class BoardPart(NamedTuple):
-    """A part of a board, or why there is none.
+class FoundBoard(NamedTuple):
+    """A board or a part of it, or why there is none.
 
     Args:
-        pixels: (corners, 2), NaN outside the part; None if there is none.
+        pixels: (corners, 2) in the board's order, good to about a pixel of the searched image; NaN where a corner was
+            not found. None if the board was not found.
         reason: why.
-        rejected: (N, 2) corners found.
+        rejected: (N, 2) corners of a grid that is not the board, or that could not be told to be.
         other: whether they are certainly those of another board.
+        factor: how many times smaller the searched image was.
     """
 
     pixels: Tensor | None
     reason: str = ""
     rejected: Tensor | None = None
     other: bool = False
+    factor: float = 1.0
 
 
 def find_part(
-    image: npt.NDArray[np.uint8], board: Board, seeds: Iterable[Tensor], best: BoardPart | None = None
-) -> BoardPart:
+    image: npt.NDArray[np.uint8], board: Board, seeds: Iterable[Tensor], best: FoundBoard | None = None
+) -> FoundBoard:
     """Find the visible corners of a board that is cut by the image's edge, covered or glaring in places.
 
     Args:
@@ -252,12 +253,10 @@ def find_part(
     Returns:
         The corners; without a reason if there is no grid at all.
     """
-    best = best or BoardPart(None)
+    best = best or FoundBoard(None)
     for seed in seeds:
-        whole = without_false_sides(image, seed)
-        if whole is None or uneven(image, whole) is not None:
-            continue
-        if skips(image, whole.reshape(-1, 2), whole.shape[1], whole.shape[0]):
+        whole = sound_grid(image, seed)
+        if whole is None:
             continue
         part = _grown(image, whole.flip(1) if handedness(whole) < 0 else whole, board)
         if part.pixels is not None:
@@ -267,7 +266,7 @@ def find_part(
     return best
 
 
-def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> BoardPart:
+def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> FoundBoard:
     """Grow a part of the board from a seed."""
     longer, shorter = max(board.columns, board.rows), min(board.columns, board.rows)
     grid = grown_grid(image, seed, longer + 1)
@@ -275,28 +274,28 @@ def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> BoardPar
     seen = grid[known]
     high, wide = grid.shape[:2]
     if len(seen) < max(MIN_CORNERS, MIN_FILLED * known.numel()) or min(high, wide) < MIN_LINES:
-        return BoardPart(None)
+        return FoundBoard(None)
     asked, size = f"{board.columns}x{board.rows}", f"{max(high, wide)}x{min(high, wide)}"
     ends = board_ends(image, grid)
     if all(ends) and (max(high, wide), min(high, wide)) != (longer, shorter):
-        return BoardPart(
+        return FoundBoard(
             None, f"a board of {size} inner corners was found, not {asked}: give --board {size}", seen, True
         )
     if max(high, wide) > longer or min(high, wide) > shorter:
-        return BoardPart(None, f"a grid of {size} inner corners was found, larger than {asked}", seen, other=True)
-    if goes_on(image, grid.reshape(-1, 2), wide, high):
-        return BoardPart(None, f"the squares go on beyond the {size} inner corners that were found", seen)
+        return FoundBoard(None, f"a grid of {size} inner corners was found, larger than {asked}", seen, other=True)
+    if goes_on(image, grid):
+        return FoundBoard(None, f"the squares go on beyond the {size} inner corners that were found", seen)
     places = _placements(image, grid, ends, board)
     if not places:
-        return BoardPart(None, f"a grid of {size} inner corners was found, which is no part of {asked}", seen)
-    if len(places) > _symmetries(board) or not _is_anchored(image, grid, ends):
+        return FoundBoard(None, f"a grid of {size} inner corners was found, which is no part of {asked}", seen)
+    if len(places) > len(board.quarter_turns) or not _is_anchored(image, grid, ends):
         where = _hidden_sides(image, grid, ends)
-        return BoardPart(
+        return FoundBoard(
             None,
             f"{len(seen)} of {board.corners} corners found, but not which ones: {where}; show two sides that meet",
             seen,
         )
-    return BoardPart(max(places, key=uprightness).reshape(-1, 2))
+    return FoundBoard(max(places, key=uprightness).reshape(-1, 2))
 
 
 def _is_anchored(image: npt.NDArray[np.uint8], grid: Tensor, ends: tuple[bool, bool, bool, bool]) -> bool:
@@ -346,8 +345,7 @@ def _placements(
     top, bottom, left, right = ends
     for _ in range(4):
         high, wide = grid.shape[:2]
-        along, down = local_steps(grid)
-        lighter = (step_along(image, grid, along, down) - step_along(image, grid, along, -down)) * checkered(grid)
+        lighter = contrast(image, grid, *local_steps(grid)) * checkered(grid)
         dark = bool(lighter.nanmedian() < 0)  # the square diagonally outside the grid's first corner
         for row in range(board.rows - high + 1):
             for column in range(board.columns - wide + 1):
@@ -361,13 +359,6 @@ def _placements(
         top, bottom, left, right = left, right, bottom, top
     # A whole board that is printed white on black has the other colors.
     return places or (inverted if all(ends) else [])
-
-
-def _symmetries(board: Board) -> int:
-    """Turns after which the board looks the same."""
-    if (board.columns + board.rows) % 2:
-        return 1
-    return 4 if board.columns == board.rows and board.columns % 2 == 0 else 2
 
 
 def _hidden_sides(image: npt.NDArray[np.generic], grid: Tensor, ends: tuple[bool, bool, bool, bool]) -> str:
@@ -401,23 +392,6 @@ _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _LOCAL_CONTRAST, _TILES = 4.0, (8, 8)  # of the adaptive histogram equalization
 
 
-class FoundBoard(NamedTuple):
-    """What a search found.
-
-    Args:
-        pixels: (corners, 2) in the board's order, good to about a pixel of the searched image; NaN where a corner was
-            not found. None if the board was not found.
-        factor: how many times smaller the searched image was.
-        reason: why the board was not found.
-        rejected: (N, 2) corners of a grid that is not the board, or that could not be told to be.
-    """
-
-    pixels: Tensor | None
-    factor: float = 1.0
-    reason: str = ""
-    rejected: Tensor | None = None
-
-
 def find_board(image: npt.NDArray[np.uint8], board: Board) -> FoundBoard:
     """Find a checkerboard's corners to about a pixel of the searched size.
 
@@ -431,7 +405,7 @@ def find_board(image: npt.NDArray[np.uint8], board: Board) -> FoundBoard:
         image: (H, W) uint8.
         board: a checkerboard of at least 3x3 inner corners.
     """
-    sizes = [(factor, *_reduced_8bit(image, factor)) for factor in _factors(image)]
+    sizes = list(search_sizes(image))
     factor, small, scale = sizes[0]
     searches = [(size, find) for size in sizes for find in (_find_classic, find_sector, _find_shadowed)]
     whole = _find_whole(searches[:1], board)
@@ -446,7 +420,7 @@ def find_board(image: npt.NDArray[np.uint8], board: Board) -> FoundBoard:
         whole = found if whole.rejected is None else whole
         part = part if part.pixels is not None else find_part(small, board, grids, part)
     if part.pixels is not None:
-        return FoundBoard(to_full_size(part.pixels, scale), factor)
+        return FoundBoard(to_full_size(part.pixels, scale), factor=factor)
     if part.rejected is not None and (part.other or whole.rejected is None):
         return FoundBoard(None, reason=part.reason, rejected=to_full_size(part.rejected, scale))
     return whole
@@ -465,13 +439,13 @@ def _find_whole(searches: Sequence[_Search], board: Board) -> FoundBoard:
             continue
         trouble = grid_trouble(small, corners, board.columns, board.rows)
         if trouble is None:
-            return FoundBoard(to_full_size(canonical_order(small, corners, board), scale), factor)
+            return FoundBoard(to_full_size(canonical_order(small, corners, board), scale), factor=factor)
         if missing.rejected is None:
             missing = FoundBoard(None, reason=trouble, rejected=to_full_size(corners, scale))
     return missing
 
 
-def _is_all(image: npt.NDArray[np.uint8], part: BoardPart, board: Board) -> bool:
+def _is_all(image: npt.NDArray[np.uint8], part: FoundBoard, board: Board) -> bool:
     """Whether no detector of whole boards finds more: another board is there, all of this one, or some is outside."""
     if part.pixels is None:
         return part.other
@@ -527,7 +501,7 @@ def to_full_size(pixels: Tensor, scale: Tensor) -> Tensor:
 
 def largest_grid(image: Gray, flags: int = cv2.CALIB_CB_EXHAUSTIVE) -> Tensor | None:
     """The corners of the largest checkerboard grid in an image, (rows, columns, 2), at least 3x3; None without one."""
-    found, corners, meta = _in_new_thread(
+    found, corners, meta = in_new_thread(
         cv2.findChessboardCornersSBWithMeta, image, (3, 3), flags | cv2.CALIB_CB_LARGER
     )
     if not found:
@@ -545,14 +519,11 @@ def seeds(image: npt.NDArray[np.uint8]) -> Iterator[Tensor]:
             yield grid
 
 
-def _reduced_8bit(image: npt.NDArray[np.uint8], factor: float) -> tuple[npt.NDArray[np.uint8], Tensor]:
-    small, scale = reduced(image, factor, (image.shape[1], image.shape[0]))
-    return small.astype(np.uint8, copy=False), scale
-
-
-def _factors(image: Gray) -> list[float]:
-    longest = max(image.shape)
-    return sorted({max(1.0, longest / side) for side in SEARCH_SIDES}, reverse=True)
+def search_sizes(image: npt.NDArray[np.uint8]) -> Iterator[_Size]:
+    """The image at the sizes at which boards are sought, smallest first, each size once."""
+    for factor in sorted({max(1.0, max(image.shape) / side) for side in SEARCH_SIDES}, reverse=True):
+        small, scale = reduced(image, factor, (image.shape[1], image.shape[0]))
+        yield factor, np.asarray(small, np.uint8), scale
 
 
 def _find_classic(image: Gray, board: Board) -> Tensor | None:
@@ -562,7 +533,7 @@ def _find_classic(image: Gray, board: Board) -> Tensor | None:
 
 def find_sector(image: Gray, board: Board, flags: int = 0) -> Tensor | None:
     """The corners that `findChessboardCornersSB` finds, (corners, 2), or None."""
-    found, corners = _in_new_thread(cv2.findChessboardCornersSB, image, (board.columns, board.rows), flags=flags)
+    found, corners = in_new_thread(cv2.findChessboardCornersSB, image, (board.columns, board.rows), flags=flags)
     return torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)) if found else None
 
 
@@ -574,7 +545,7 @@ def _equalized(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     return np.asarray(cv2.createCLAHE(_LOCAL_CONTRAST, _TILES).apply(image), dtype=np.uint8)
 
 
-def _in_new_thread(detector: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+def in_new_thread(detector: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
     """Call a detector in a new thread.
 
     OpenCV's random numbers have one state per thread. In a new thread the same image always gives the same corners,

@@ -182,21 +182,23 @@ def sharpest(frames: Iterator[Frame]) -> Iterator[Frame]:
 
 
 def _sharpest(moments: Iterable[list[Frame]]) -> Iterator[list[Frame]]:
-    held: list[tuple[float, list[Frame]]] = []
+    # Of a group: its sharpest moment so far, how sharp that is, when it began, and how many moments it has.
+    best, sharp, began, count = list[Frame](), 0.0, 0, 0
     for moment in moments:
-        if held and (_taken_at(moment) - _taken_at(held[0][1]) > _GROUP_NS):
-            yield max(held, key=lambda item: item[0])[1]
-            held.clear()
-        held.append((min(_sharpness(frame.image) for frame in moment), moment))
-        if len(held) == _GROUP:
-            yield max(held, key=lambda item: item[0])[1]
-            held.clear()
-    if held:
-        yield max(held, key=lambda item: item[0])[1]
-
-
-def _taken_at(moment: list[Frame]) -> int:
-    return stamp_in(moment[0].path or "") or 0
+        taken = stamp_in(moment[0].path or "") or 0
+        if count and taken - began > _GROUP_NS:
+            yield best
+            count = 0
+        own = min(_sharpness(frame.image) for frame in moment)
+        began = began if count else taken
+        if not count or own > sharp:
+            best, sharp = moment, own
+        count += 1
+        if count == _GROUP:
+            yield best
+            count = 0
+    if count:
+        yield best
 
 
 def detect_video(

@@ -5,6 +5,7 @@ Principal points are shifted so that (0, 0) is the center of the first pixel; po
 
 from __future__ import annotations
 
+import configparser
 import dataclasses
 import math
 import re
@@ -152,6 +153,31 @@ def moved_by(quaternion: Sequence[float], translation: Sequence[float]) -> Pose:
     length = turn[1:].norm()
     rotation = rotation_from_vector(2.0 * torch.atan2(length, turn[0]) * turn[1:] / length.clamp_min(1e-300))
     return checked_pose(rotation.tolist(), translation)
+
+
+def pose_of(matrix: Any, what: str) -> Pose:
+    """A pose from a matrix of three or four rows of four numbers."""
+    whole = torch.tensor(numbers(matrix, (12, 16), what), dtype=torch.float64).reshape(-1, 4)
+    return checked_pose(whole[:3, :3].tolist(), whole[:3, 3].tolist())
+
+
+def poses_from_root(parents: Mapping[str, tuple[str, Pose]], frames: Sequence[str]) -> tuple[Pose, ...]:
+    """Each frame's pose from the one that all hang on; `parents` has parent_from_frame of each that hangs on another.
+
+    Empty if they do not hang together, or for a frame alone.
+    """
+    poses, roots = [], set()
+    for frame in frames:
+        pose, passed = Pose.still(), {frame}
+        while frame in parents:
+            frame, parent_from_child = parents[frame]
+            pose = parent_from_child.after(pose)
+            if frame in passed:
+                return ()
+            passed.add(frame)
+        roots.add(frame)
+        poses.append(pose.inverse())
+    return tuple(poses) if len(roots) == 1 and len({*frames}) == len(frames) > 1 else ()
 
 
 def quaternion_of(rotation: Tensor) -> list[float]:
@@ -341,6 +367,13 @@ def reading(path: str | Path, what: str) -> Iterator[None]:
 def dump_yaml(content: Mapping[str, Any]) -> str:
     """YAML text with exact numbers, short lists on one line."""
     return yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None, width=120)
+
+
+def ini_sections(text: str) -> dict[str, dict[str, str]]:
+    """Values of an INI file by section."""
+    sections = configparser.RawConfigParser(strict=True)
+    sections.read_string(text)
+    return {name: dict(sections[name]) for name in sections.sections()}
 
 
 def core_of(matrix: Any, what: str) -> tuple[list[float], float]:

@@ -236,39 +236,49 @@ _FAR = 0.5
 
 
 def foreign_camera(
-    kind: str, name: str, core: Sequence[float], size: Sequence[int], own: Sequence[float], skew: float = 0.0
-) -> tuple[Camera, str]:
-    """The hybrid camera that comes nearest to another program's lens over the image, and a note on how near.
+    kind: str,
+    name: str,
+    core: Sequence[float],
+    size: Sequence[int],
+    own: Sequence[float],
+    notes: list[str],
+    skew: float = 0.0,
+) -> Camera:
+    """The camera of a lens: of a model of kcal, or the hybrid camera that comes nearest to it over the image.
 
     Args:
-        kind: of `LENSES`.
+        kind: a model of kcal, or of `LENSES`.
         name: of the camera.
         core: fx, fy, cx, cy in kcal's convention.
         size: (width, height).
-        own: the lens's parameters in the order of the table.
+        own: the lens's parameters in the order of the model or of the table.
+        notes: get a sentence on how near a hybrid camera comes.
         skew: change of a column with y.
 
     Raises:
         ValueError: a parameter out of range, or a lens that no hybrid lens follows.
     """
+    if kind not in LENSES:
+        return foreign.named_camera(name, core, size, kind, own, skew)
     known = LENSES[kind]
     for value, (low, high) in zip(own, known.limits, strict=False):
         if not low < value < high:
             raise ValueError(f"{name}: {kind} with a parameter of {value:g}; from {low} to {high:g} is possible")
     camera = foreign.named_camera(name, core, size, "pinhole", (), skew)
     values = (*camera.params.tolist(), *own, *[0.0] * (len(known.names) - len(own)))
-    return nearest_hybrid(ForeignCamera(kind, values, camera.size, name).unproject, camera, f"its {kind} lens")
+    return nearest_hybrid(ForeignCamera(kind, values, camera.size, name).unproject, camera, f"its {kind} lens", notes)
 
 
 def nearest_hybrid(
-    unproject: Callable[[Tensor], tuple[Tensor, Tensor]], like: Camera, title: str
-) -> tuple[Camera, str]:
-    """The hybrid camera through the rays that pixels (N, 2) have, and a note on how near it comes.
+    unproject: Callable[[Tensor], tuple[Tensor, Tensor]], like: Camera, title: str, notes: list[str]
+) -> Camera:
+    """The hybrid camera through the rays that pixels (N, 2) have.
 
     Args:
         unproject: rays (N, 3) of pixels, and which have one.
         like: a camera of that size and name.
         title: what the lens is called.
+        notes: get a sentence on how near it comes.
 
     Raises:
         ValueError: hardly a pixel has a ray, or no hybrid lens follows.
@@ -296,7 +306,8 @@ def nearest_hybrid(
         raise ValueError(f"{name}: no lens of kcal follows {title}: the nearest is {most:.2g} px off")
     covered = float(len(rays) / (_BETWEEN[0] * _BETWEEN[1]))
     rest = "" if covered == 1.0 else f"; {1.0 - covered:.1%} of the image has no ray"
-    return camera, f"{name}: {title} became kcal's hybrid lens, RMS {rms:.2g} px, at most {most:.2g} px{rest}"
+    notes.append(f"{name}: {title} became kcal's hybrid lens, RMS {rms:.2g} px, at most {most:.2g} px{rest}")
+    return camera
 
 
 def fit_foreign(kind: str, camera: Camera) -> ForeignCamera:

@@ -17,7 +17,7 @@ from typing import Any
 from kcal.bag import TF, Bag, message_types, open_bag
 from kcal.errors import InputError, with_extra
 from kcal.files import write_atomic
-from kcal.io.foreign import Hints, ImportedCameras, camera_name, checked_pose, plain
+from kcal.io.foreign import Hints, ImportedCameras, camera_name, moved_by, plain, poses_from_root, quaternion_of
 from kcal.io.format_opencv import ros_camera, ros_values
 from kcal.lens.camera import Camera
 from kcal.lens.pose import Pose
@@ -81,28 +81,14 @@ def _as_in_a_file(message: Any) -> dict[str, Any]:
 
 def _tf_poses(bag: Bag, frames: Sequence[str]) -> tuple[Pose, ...]:
     """Each camera's pose from the frame that all hang on; empty if that is not said."""
-    from scipy.spatial.transform import Rotation  # which takes long to load
-
     above: dict[str, tuple[str, Pose]] = {}
     for topic in bag.topics(TF):
         for _, data in bag.messages(topic) if topic.endswith("tf_static") else ():
             for one in bag.decoded(data, TF).transforms:
                 turn, shift = one.transform.rotation, one.transform.translation
-                rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
-                pose = checked_pose(rotation.tolist(), [shift.x, shift.y, shift.z])
+                pose = moved_by([turn.w, turn.x, turn.y, turn.z], [shift.x, shift.y, shift.z])
                 above[one.child_frame_id.strip("/")] = (one.header.frame_id.strip("/"), pose)
-    poses, roots = [], set()
-    for frame in frames:
-        pose, passed = Pose.still(), {frame}
-        while frame in above:
-            frame, parent_from_child = above[frame]
-            pose = parent_from_child.after(pose)
-            if frame in passed:
-                return ()
-            passed.add(frame)
-        roots.add(frame)
-        poses.append(pose.inverse())
-    return tuple(poses) if len(roots) == 1 and len({*frames}) == len(frames) > 1 else ()
+    return poses_from_root(above, frames)
 
 
 def write_bag(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
@@ -115,8 +101,6 @@ def write_bag(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> l
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: the suffix says which bag it will be: .bag (ROS 1), .mcap or .db3 (ROS 2)")
-    from scipy.spatial.transform import Rotation
-
     with with_extra("ros", "bags need"):
         from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
         from rosbags.rosbag1 import Writer as Writer1
@@ -141,9 +125,9 @@ def write_bag(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> l
         messages.append((f"/{name}/camera_info", _INFO, values))
     links = []
     for frame, pose in zip(frames, poses, strict=False):
-        turn = Rotation.from_matrix(plain(pose.rotation.mT)).as_quat().tolist()
+        w, *turn = quaternion_of(pose.rotation.mT)
         move = {"translation": dict(zip("xyz", plain(pose.center), strict=True)),
-                "rotation": dict(zip("xyzw", turn, strict=True))}  # fmt: skip
+                "rotation": dict(zip("xyzw", [*turn, w], strict=True))}  # fmt: skip
         links.append({"header": header("rig"), "child_frame_id": frame, "transform": move})
     if links:
         messages.append(("/tf_static", TF, {"transforms": links}))

@@ -5,7 +5,6 @@ Each reader says by the names of `kcal.io.keyed` what its file means. Sizes, len
 
 from __future__ import annotations
 
-import configparser
 import dataclasses
 import re
 from collections.abc import Callable, Mapping
@@ -17,7 +16,19 @@ import torch
 
 from kcal.file_kind import check_image_header, is_image
 from kcal.files import read_bytes
-from kcal.io.foreign import Hints, ImportedCameras, checked_pose, known_size, numbers, plain, reading
+from kcal.io.foreign import (
+    Hints,
+    ImportedCameras,
+    checked_pose,
+    ini_sections,
+    known_size,
+    moved_by,
+    numbers,
+    plain,
+    pose_of,
+    poses_from_root,
+    reading,
+)
 from kcal.io.keyed import read_keyed
 from kcal.lens.pose import Pose, rotation_from_vector
 from kcal.strict_formats import read_yaml
@@ -59,17 +70,8 @@ def _depthai(text: str, path: Path, hints: Hints) -> Found:
             shift = [0.01 * float(stated["translation"][axis]) for axis in "xyz"]
             pose = checked_pose(numbers(stated["rotationMatrix"], 9, "rotationMatrix"), shift)
             steps[name] = f"CAM_{chr(65 + int(stated['toCameraSocket']))}", pose
-    ends = {}
-    for name in cameras:
-        end, whole = name, Pose.still()
-        for _ in steps:
-            if end in steps:
-                end, step = steps[end]
-                whole = step.after(whole)
-        ends[name] = end, whole.inverse()
-    if len({end for end, _ in ends.values()} - set(steps)) == 1 and len(cameras) > 1:
-        for name, (_, pose) in ends.items():
-            _give_pose(cameras[name], pose)
+    for name, pose in zip(cameras, poses_from_root(steps, list(cameras)), strict=False):
+        _give_pose(cameras[name], pose)
     return cameras, notes
 
 
@@ -141,9 +143,7 @@ def _zed(text: str, path: Path, hints: Hints) -> Found:
 
     `CV` is the rotation about y. Coefficients stand with the camera, or for all resolutions in `[LEFT_DISTO]`.
     """
-    sections = configparser.RawConfigParser(strict=True)
-    sections.read_string(text)
-    own = {name.upper(): dict(sections[name]) for name in sections.sections()}
+    own = {name.upper(): section for name, section in ini_sections(text).items()}
     kinds = [name.removeprefix("LEFT_CAM_") for name in own if name.startswith("LEFT_CAM_")]
     if unknown := set(kinds) - set(_ZED_SIZES):
         raise ValueError(f"resolution {min(unknown)}: kcal knows {', '.join(_ZED_SIZES)}")
@@ -177,9 +177,8 @@ def _zed(text: str, path: Path, hints: Hints) -> Found:
 def _euroc(text: str, path: Path, hints: Hints) -> Found:
     """T_BS leads from the sensor to the body; the files of two cameras are a rig."""
     content = dict(read_yaml(text, str(path)))
-    whole = _stated_matrix(content.pop("T_BS"), 4, "T_BS")
     name = path.parent.name if path.stem == "sensor" else path.stem
-    _give_pose(content, checked_pose(whole[:3, :3].tolist(), whole[:3, 3].tolist()).inverse())
+    _give_pose(content, pose_of(content.pop("T_BS"), "T_BS").inverse())
     return {name: content | {"name": name}}, []
 
 
@@ -224,8 +223,7 @@ def _open3d(text: str, path: Path, hints: Hints) -> Found:
         part = {"K": _stated_matrix(own["intrinsic_matrix"], 3, "intrinsic_matrix").T.ravel().tolist(),
                 "width": own["width"], "height": own["height"]}  # fmt: skip
         if "extrinsic" in item and len(items) == 1:
-            whole = _stated_matrix(item["extrinsic"], 4, "extrinsic").T
-            _give_pose(part, checked_pose(whole[:3, :3].tolist(), whole[:3, 3].tolist()))
+            _give_pose(part, pose_of(_stated_matrix(item["extrinsic"], 4, "extrinsic").T, "extrinsic"))
         if part not in cameras.values():
             cameras[f"camera_{number}" if len(items) > 1 else path.stem] = part
     return cameras, ["the poses of the trajectory are not kept"] if len(items) > 1 else []
@@ -239,11 +237,8 @@ def _nuscenes(text: str, path: Path, hints: Hints) -> Found:
     for one in records:
         part = {"K": one["camera_intrinsic"], "size": known_size(hints.size)}
         if single:
-            w, *axis = numbers(one["rotation"], 4, "rotation")
-            length = float(np.linalg.norm(axis))
-            turn = 2.0 * np.arctan2(length, w) / (length or 1.0) * np.array(axis)
-            rotation = rotation_from_vector(torch.from_numpy(turn))
-            _give_pose(part, checked_pose(plain(rotation), numbers(one["translation"], 3, "translation")).inverse())
+            turn, shift = (numbers(one[key], count, key) for key, count in (("rotation", 4), ("translation", 3)))
+            _give_pose(part, moved_by(turn, shift).inverse())
         cameras[str(one["token"])] = part
     return cameras, [] if single else ["cameras of several vehicles or logs: their poses are not read"]
 

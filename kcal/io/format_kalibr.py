@@ -12,7 +12,7 @@ import numpy as np
 
 import kcal.io.foreign as foreign
 from kcal.files import dump_json, read_bytes, read_text, write_atomic
-from kcal.io.foreign_lenses import LENSES, ForeignCamera, as_written, foreign_camera
+from kcal.io.foreign_lenses import ForeignCamera, as_written, foreign_camera
 from kcal.lens.camera import Camera
 from kcal.lens.pose import Pose
 from kcal.strict_formats import MOST_YAML, read_yaml
@@ -97,12 +97,8 @@ def _chain_camera(name: str, part: Mapping[str, Any], notes: list[str]) -> Camer
     terms = foreign.numbers(part.get("distortion_coeffs", []), count, f"{name} distortion_coeffs")
     if lens == "none" and any(terms):
         raise ValueError("distortion_model none with coefficients")
-    if plain:
-        return foreign.named_camera(name, (fu, fv, pu, pv), size, _LENSES[lens], terms)
     own = [*values, *(terms if lens != "none" else [])]
-    camera, note = foreign_camera(kind, name, (fu, fv, pu, pv), size, own)
-    notes.append(note)
-    return camera
+    return foreign_camera(_LENSES[lens] if plain else kind, name, (fu, fv, pu, pv), size, own, notes)
 
 
 def _read_results(text: str, hints: foreign.Hints) -> foreign.ImportedCameras:
@@ -190,12 +186,8 @@ def _basalt_camera(name: str, lens: Mapping[str, Any], size: tuple[int, int], no
     core, own = ([foreign.numbers(given[key], 1, key)[0] for key in keys] for keys in (("fx", "fy", "cx", "cy"), terms))
     given.get("rpmax")
     given.rest(f"{name}.")
-    if model not in LENSES:
-        return foreign.named_camera(name, core, size, model, own)
     # The unified lens is the enhanced one with β = 1.
-    camera, note = foreign_camera(model, name, core, size, [*own, 1.0] if kind == "ucm" else own)
-    notes.append(note)
-    return camera
+    return foreign_camera(model, name, core, size, [*own, 1.0] if kind == "ucm" else own, notes)
 
 
 def write_basalt(cameras: Sequence[Camera | ForeignCamera], poses: Sequence[Pose], path: Path) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import configparser
 import dataclasses
 import io
 import json
@@ -25,6 +24,7 @@ from kcal.io.foreign import (
     checked_pose,
     core_of,
     dump_yaml,
+    ini_sections,
     known_size,
     named_camera,
     numbers,
@@ -72,17 +72,20 @@ def write_opencv(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -
     file.write("image_height", cameras[0].size[1])
     keys = [("camera_matrix", "distortion_coefficients")] if len(cameras) == 1 else [("M1", "D1"), ("M2", "D2")]
     for camera, (matrix, coefficients) in zip(cameras, keys, strict=True):
-        lens = camera.coefficients.tolist()
-        # Four coefficients could be a fisheye's.
-        lens += [0.0] * (5 - len(lens)) if not camera.model.fisheye else []
         file.write(matrix, np.array(plain(camera.matrix)))
-        file.write(coefficients, np.array([lens]))
+        file.write(coefficients, np.array([_five(camera)]))
     file.write("fisheye_model", int(cameras[0].model.fisheye))
     if len(cameras) == 2 and poses:
         pair = ImportedCameras(format="opencv", cameras=tuple(cameras), poses=tuple(poses)).rig()
         file.write("R", np.array(plain(pair.right_from_left_rotation)))
         file.write("T", np.array(plain(pair.right_from_left_translation))[:, None])
     return [write_atomic(path, file.releaseAndGetString())]
+
+
+def _five(camera: Camera) -> list[float]:
+    """The coefficients, five at least where the lens is no fisheye: four could be a fisheye's."""
+    lens: list[float] = camera.coefficients.tolist()
+    return lens if camera.model.fisheye else lens + [0.0] * (5 - len(lens))
 
 
 # ROS's `camera_info` files, as camera_calibration writes and camera_info_manager reads them: one file per camera.
@@ -183,9 +186,8 @@ def ros_values(
     if len(cameras) == 2 and poses:
         rectified = _rectify(ImportedCameras(format="ros", cameras=tuple(cameras), poses=tuple(poses)))
     for camera, matrix, turned in zip(cameras, matrices, rectified, strict=True):
-        lens = camera.coefficients.tolist()
+        lens = _five(camera)
         kind = "equidistant" if camera.model.fisheye else "rational_polynomial" if len(lens) > 5 else "plumb_bob"
-        lens += [0.0] * (5 - len(lens)) if kind == "plumb_bob" else []
         yield camera.size, kind, [matrix, np.array([lens]), *turned]
 
 
@@ -221,9 +223,7 @@ def read_toml(path: Path, hints: Hints) -> ImportedCameras:
     except tomllib.TOMLDecodeError:
         if path.suffix.lower() == ".toml":
             raise
-        sections = configparser.RawConfigParser(strict=True)
-        sections.read_string(text)
-        content = {name: dict(sections[name]) for name in sections.sections()}
+        content = ini_sections(text)
     return read_keyed(content, path.stem, hints, "toml")
 
 
@@ -231,8 +231,6 @@ def write_toml(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> 
     """Write cameras as aniposelib does, with translations in meters."""
     lines: list[str] = []
     for index, camera in enumerate(cameras):
-        lens = camera.coefficients.tolist()
-        lens += [0.0] * (5 - len(lens)) if not camera.model.fisheye else []
         rotation, translation = [0.0] * 3, [0.0] * 3
         if poses:
             rotation, translation = plain(vector_from_rotation(poses[index].rotation)), plain(poses[index].translation)
@@ -242,7 +240,7 @@ def write_toml(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> 
             f"name = {json.dumps(camera_name(camera, f'cam_{index}'))}",
             f"size = {[float(side) for side in camera.size]}",
             f"matrix = {plain(camera.matrix)}",
-            f"distortions = {lens}",
+            f"distortions = {_five(camera)}",
             f"rotation = {rotation}",
             f"translation = {translation}",
             f"fisheye = {str(camera.model.fisheye).lower()}",
@@ -286,7 +284,7 @@ def write_multical(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path)
             "model": kinds.get(camera.model.size, "standard"),
             "image_size": list(camera.size),
             "K": plain(camera.matrix),
-            "dist": [camera.coefficients.tolist() + [0.0] * (5 - camera.model.size)],
+            "dist": [_five(camera)],
         }
         for name, camera in zip(names, cameras, strict=True)
     }
@@ -350,8 +348,9 @@ def read_matlab(path: Path, hints: Hints) -> ImportedCameras:
     for name, value in candidates:
         inner = value.get("Intrinsics", value) if isinstance(value, Mapping) else {}
         if isinstance(inner, Mapping) and "MappingCoefficients" in inner:
-            camera, note = _scaramuzza(inner, name, hints)
-            return ImportedCameras(format="matlab", cameras=(camera,), notes=(note,))
+            notes: list[str] = []
+            camera = _scaramuzza(inner, name, hints, notes)
+            return ImportedCameras(format="matlab", cameras=(camera,), notes=tuple(notes))
         if isinstance(value, Mapping) and {"K", "IntrinsicMatrix", "FocalLength"} & set(value):
             found = ImportedCameras(format="matlab", cameras=(_matlab_camera(value, name, hints),))
             return _with_errors(found, [errors.get("IntrinsicsErrors")])
@@ -414,7 +413,7 @@ def _matlab_camera(value: Mapping[str, Any], name: str, hints: Hints) -> Camera:
     return named_camera(name, (fx, fy, cx - 1, cy - 1), size, f"opencv{len(lens)}", lens, skew)
 
 
-def _scaramuzza(value: Mapping[str, Any], name: str, hints: Hints) -> tuple[Camera, str]:
+def _scaramuzza(value: Mapping[str, Any], name: str, hints: Hints, notes: list[str]) -> Camera:
     """MATLAB's `fisheyeIntrinsics`: the ray of a place (x, y) on the sensor is (x, y, a0 + a2 ρ² + a3 ρ³ + a4 ρ⁴).
 
     Source: Scaramuzza, Martinelli and Siegwart 2006, and MATLAB's documentation of `fisheyeIntrinsics`.
@@ -434,7 +433,7 @@ def _scaramuzza(value: Mapping[str, Any], name: str, hints: Hints) -> tuple[Came
         return torch.nn.functional.normalize(torch.cat([plane, depth[:, None]], -1), dim=-1), grows
 
     like = named_camera(name, (a0, a0, u - 1.0, v - 1.0), size, "pinhole")
-    return nearest_hybrid(unproject, like, "its fisheye lens of MATLAB")
+    return nearest_hybrid(unproject, like, "its fisheye lens of MATLAB", notes)
 
 
 def _pair(value: Mapping[str, Any], hints: Hints) -> ImportedCameras:

@@ -92,8 +92,8 @@ def _agisoft_camera(sensor: Element, number: int, notes: list[str]) -> Camera:
     if kind == "equisolid_fisheye" or any(value for tag, value in given.items() if tag not in own):
         kind = kinds[kind]
         terms = [given[tag] for tag in LENSES[kind].names]
-        camera, note = foreign_camera(kind, name, core, (width, height), terms, skew)
-        notes.append(note if sensor.find("covariance") is None else f"{note}; its error bars are not kept")
+        camera = foreign_camera(kind, name, core, (width, height), terms, notes, skew)
+        notes[-1] += "" if sensor.find("covariance") is None else "; its error bars are not kept"
         return camera
     camera = foreign.named_camera(name, core, (width, height), model, lens, skew)
     covariance = _sensor_covariance(sensor, own, names)
@@ -264,13 +264,10 @@ def _colmap_camera(number: int, name: str, size: tuple[int, int], values: Sequen
     fx = given.pop("fx", None) or given["f"]
     fy = given.pop("fy", None) or given.pop("f")
     cx, cy = given.pop("cx") - _HALF, given.pop("cy") - _HALF
-    if known.model in LENSES:
-        own = [given.get(name, 0.0) for name in LENSES[known.model].names]
-        camera, note = foreign_camera(known.model, str(number), (fx, fy, cx, cy), size, own)
-        notes.append(note)
-        return camera
-    # What is left are coefficients, and kcal has the same names in the same order.
-    return foreign.named_camera(str(number), (fx, fy, cx, cy), size, known.model, list(given.values()))
+    # What is left are coefficients, and models of kcal have the same names in the same order.
+    names = LENSES[known.model].names if known.model in LENSES else given
+    own = [given.get(name, 0.0) for name in names]
+    return foreign_camera(known.model, str(number), (fx, fy, cx, cy), size, own, notes)
 
 
 def _known(name: str) -> ColmapModel:
@@ -502,11 +499,7 @@ def _opensfm_camera(name: str, value: foreign.Keys, notes: list[str]) -> Camera:
     )
     lens = [float(value.get(key, 0.0)) for key in names]
     value.rest()
-    if model not in LENSES:
-        return foreign.named_camera(name, (fx, fy, cx, cy), size, model, lens)
-    camera, note = foreign_camera(model, name, (fx, fy, cx, cy), size, lens)
-    notes.append(note)
-    return camera
+    return foreign_camera(model, name, (fx, fy, cx, cy), size, lens, notes)
 
 
 def write_opensfm(cameras: Sequence[Camera | ForeignCamera], poses: Sequence[Pose], path: Path) -> list[Path]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,44 +48,41 @@ class Parameter(NamedTuple):
     offset: float = 0.0
 
 
+# What programs call kcal's parameters, where they call them otherwise; and what is added to the principal point.
+_NAMES = {
+    "gtsam": {"skew": "s", "cx": "u0", "cy": "v0"},
+    "nerfstudio": {"fx": "fl_x", "fy": "fl_y"},
+    "kalibr": {"fx": "fu", "fy": "fv", "cx": "pu", "cy": "pv", "p1": "r1", "p2": "r2"},
+    "matlab": {
+        "fx": "FocalLength(1)", "fy": "FocalLength(2)", "cx": "PrincipalPoint(1)", "cy": "PrincipalPoint(2)",
+        "skew": "Skew", "k1": "RadialDistortion(1)", "k2": "RadialDistortion(2)", "k3": "RadialDistortion(3)",
+        "p1": "TangentialDistortion(1)", "p2": "TangentialDistortion(2)",
+    },
+    "opensfm": {"fx": "focal_x", "fy": "focal_y", "cx": "c_x", "cy": "c_y"},
+}  # fmt: skip
+_FIRST = {"colmap": 0.5, "nerfstudio": 0.5, "matlab": 1.0}
+_KALIBR = {"pinhole": "pinhole-none", "opencv4": "pinhole-radtan", "fisheye4": "pinhole-equi"}
+
+
 def arranged(program: str, camera: Camera) -> tuple[str, list[Parameter]]:
     """The program's name of a camera's lens model, and its parameters in the program's order."""
-    model, lens = str(camera.model), list(camera.model.names)
-    width, height = camera.size
-    core, half = ["fx", "fy", "cx", "cy"], {"cx": 0.5, "cy": 0.5}
-    if program == "gtsam":
-        names = dict(zip(["fx", "fy", "s", "u0", "v0"], ["fx", "fy", "skew", "cx", "cy"], strict=True))
-        return _GTSAM[model], [Parameter(name, own) for name, own in names.items()] + [Parameter(k, k) for k in lens]
-    if program == "colmap":
-        return WRITTEN[model], [Parameter(name, name, 1.0, half.get(name, 0.0)) for name in core + lens]
-    if program == "nerfstudio":
-        kind = "OPENCV_FISHEYE" if camera.model.fisheye else "OPENCV"
-        return kind, [Parameter(name.replace("fx", "fl_x").replace("fy", "fl_y"), name, 1.0, half.get(name, 0.0))
-                      for name in core + lens]  # fmt: skip
-    if program == "kalibr":
-        kind = {"pinhole": "pinhole-none", "opencv4": "pinhole-radtan", "fisheye4": "pinhole-equi"}[model]
-        own = ["fu", "fv", "pu", "pv", *(name.replace("p", "r") for name in lens)]
-        return kind, [Parameter(*pair) for pair in zip(own, core + lens, strict=True)]
-    if program == "matlab":
-        there = {"fx": "FocalLength(1)", "fy": "FocalLength(2)", "cx": "PrincipalPoint(1)", "cy": "PrincipalPoint(2)",
-                 "skew": "Skew", "k1": "RadialDistortion(1)", "k2": "RadialDistortion(2)", "k3": "RadialDistortion(3)",
-                 "p1": "TangentialDistortion(1)", "p2": "TangentialDistortion(2)"}  # fmt: skip
-        one = {"cx": 1.0, "cy": 1.0}
-        return "cameraIntrinsics", [
-            Parameter(there[name], name, 1.0, one.get(name, 0.0)) for name in [*core, "skew", *lens]
-        ]
+    model, lens, fisheye = str(camera.model), camera.model.names, camera.model.fisheye
+    kinds = {
+        "gtsam": _GTSAM.get(model), "colmap": WRITTEN.get(model), "kalibr": _KALIBR.get(model),
+        "nerfstudio": "OPENCV_FISHEYE" if fisheye else "OPENCV", "opensfm": "fisheye_opencv" if fisheye else "brown",
+        "mrcal": f"LENSMODEL_OPENCV{len(lens)}" if lens else "LENSMODEL_PINHOLE", "matlab": "cameraIntrinsics",
+    }  # fmt: skip
+    orders = {"gtsam": ("fx", "fy", "skew", "cx", "cy"), "matlab": ("fx", "fy", "cx", "cy", "skew")}
+    offset, scale = dict.fromkeys(("cx", "cy"), _FIRST.get(program, 0.0)), dict[str, float]()
     if program == "opensfm":
-        size = float(max(width, height))
-        there = {"fx": "focal_x", "fy": "focal_y", "cx": "c_x", "cy": "c_y"}
-        middle = {"cx": -(width - 1) / 2.0 / size, "cy": -(height - 1) / 2.0 / size}
-        kind = "fisheye_opencv" if camera.model.fisheye else "brown"
-        return kind, [
-            *(Parameter(there[name], name, 1.0 / size, middle.get(name, 0.0)) for name in core),
-            *(Parameter(name, name) for name in lens),
-        ]
-    if program == "mrcal":
-        model = f"LENSMODEL_{'PINHOLE' if not lens else f'OPENCV{len(lens)}'}"
-    return model, [Parameter(name, name) for name in core + lens]
+        size = float(max(camera.size))
+        scale = dict.fromkeys(("fx", "fy", "cx", "cy"), 1.0 / size)
+        offset = {name: -(side - 1) / 2.0 / size for name, side in zip(("cx", "cy"), camera.size, strict=True)}
+    own = (*orders.get(program, ("fx", "fy", "cx", "cy")), *lens)
+    names = _NAMES.get(program, {})
+    return kinds.get(program) or model, [
+        Parameter(names.get(name, name), name, scale.get(name, 1.0), offset.get(name, 0.0)) for name in own
+    ]
 
 
 def prior_of(program: str, camera: Camera, misfit: tuple[float, float] | None = None) -> dict[str, Any]:
@@ -131,13 +129,12 @@ def write_priors(program: str, priors: Sequence[dict[str, Any]], path: Path) -> 
     return write_atomic(path, json.dumps(content, indent=1) + "\n")
 
 
-def prior_writer(program: str) -> Any:
-    """A writer of cameras as `CameraFormat.write` is one, for programs without a file format of cameras."""
+def _write(program: str, cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
+    """Cameras for a program without a file format of cameras."""
+    return [write_priors(program, [prior_of(program, camera) for camera in cameras], path)]
 
-    def write(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:
-        return [write_priors(program, [prior_of(program, camera) for camera in cameras], path)]
 
-    return write
+write_gtsam, write_ceres, write_numpy = (partial(_write, program) for program in ("gtsam", "ceres", "numpy"))
 
 
 def read_prior(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
@@ -156,6 +153,9 @@ def read_prior(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
         if part.get("misfit_px")
     ]
     return foreign.ImportedCameras(format=program, cameras=cameras, notes=tuple(fitted))
+
+
+read_gtsam = read_ceres = read_numpy = read_prior
 
 
 def ceres_prior(path: str | Path, camera: Any, *, pixel_sigma: float, number: int = 0) -> Any:

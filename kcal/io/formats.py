@@ -8,7 +8,8 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import torch
 
@@ -43,33 +44,43 @@ from kcal.strict_json import MOST_BYTES as MOST_JSON
 from kcal.strict_json import read_json
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CameraFormat:
-    """A format of another program.
+class CameraFormat(NamedTuple):
+    """A format of another program. Its module has `read_NAME(path, hints)` and, if kcal writes it, `write_NAME`.
 
     Args:
+        name: of the format.
+        module: that reads and writes it.
         title: what the files are.
         models: kcal's lens models that it can hold.
-        read: one file.
         suffixes: of file names that mean this format where nothing else is said.
-        write: cameras and their poses, all of one of the models; None for formats that kcal only reads.
-        skew: whether it can hold a skew.
         poses: of how many cameras it can hold the relative poses.
+        skew: whether it can hold a skew.
         prior: whether it is a file of priors, which has the parameters and their square-root information.
         lenses: lenses of `kcal.io.foreign_lenses.LENSES` that it can hold as well.
         wide: whether these are chosen unasked where kcal's models are far off.
     """
 
+    name: str
+    module: ModuleType
     title: str
-    models: tuple[str, ...]
-    read: Callable[[Path, Hints], ImportedCameras]
+    models: tuple[str, ...] = ()
     suffixes: tuple[str, ...] = ()
-    write: Callable[[Sequence[Any], Sequence[Pose], Path], list[Path]] | None = None
+    poses: int = 0
     skew: bool = False
-    poses: int = 2
     prior: bool = False
     lenses: tuple[str, ...] = ()
     wide: bool = False
+
+    @property
+    def read(self) -> Callable[[Path, Hints], ImportedCameras]:
+        """Read one file."""
+        read: Callable[[Path, Hints], ImportedCameras] = getattr(self.module, f"read_{self.name}")
+        return read
+
+    @property
+    def write(self) -> Callable[[Sequence[Any], Sequence[Pose], Path], list[Path]] | None:
+        """Write cameras and their poses, all of one of the models; None for formats that kcal only reads."""
+        return getattr(self.module, f"write_{self.name}", None)
 
 
 _ANY = 1_000_000
@@ -79,122 +90,58 @@ _SECTION = re.compile(r"(?:[ \t]*(?:[#;].*)?\n)*+[ \t]*\[\w[\w .-]*\][ \t]*\n")
 _XML = re.compile(r"<cameras(?=>\s*<camera[^>]*serial)|<sensors(?=[ >])|<calibration(?=>\s*<(projection|width|type))")
 
 
-def _prior_format(program: str, title: str, models: tuple[str, ...]) -> CameraFormat:
-    return CameraFormat(
-        title=title, models=models, read=format_prior.read_prior,
-        write=format_prior.prior_writer(program), skew=program == "gtsam", poses=0, prior=True,
-    )  # fmt: skip
-
-
-FORMATS = {
-    "opencv": CameraFormat(
-        title="OpenCV YAML, XML or JSON, one camera or a pair",
-        suffixes=(".yml", ".yaml", ".xml"),
-        models=(*OPENCV_MODELS.values(), "fisheye4"),
-        read=format_opencv.read_opencv,
-        write=format_opencv.write_opencv,
+_OPENCV, _ROS = (*OPENCV_MODELS.values(), "fisheye4"), ("pinhole", "opencv4", "opencv5", "opencv8", "fisheye4")
+_KALIBR, _MRCAL = tuple(format_kalibr.KALIBR_LENSES), ("pinhole", "opencv4", "opencv5", "opencv8", "opencv12")
+_DEVICES = "depthai, Azure Kinect, RealSense, ZED, EuRoC, KITTI, Open3D, nuScenes, photos of DJI's drones"
+_LIST = (
+    CameraFormat(
+        "opencv", format_opencv, "OpenCV YAML, XML or JSON, one camera or a pair", _OPENCV, (".yml", ".yaml", ".xml"), 2
     ),
-    "ros": CameraFormat(
-        title="ROS camera_info, a file per camera",
-        models=("pinhole", "opencv4", "opencv5", "opencv8", "fisheye4"),
-        read=format_opencv.read_ros,
-        write=format_opencv.write_ros,
-    ),
-    "bag": CameraFormat(
-        title="ROS bag with camera_info and tf",
-        suffixes=format_bag.SUFFIXES,
-        models=("pinhole", "opencv4", "opencv5", "opencv8", "fisheye4"),
-        read=format_bag.read_bag,
-        write=format_bag.write_bag,
-        poses=_ANY,
-    ),
-    "kalibr": CameraFormat(
-        title="Kalibr camchain",
-        models=("pinhole", "opencv4", "fisheye4"),
-        read=format_kalibr.read_kalibr,
-        write=format_kalibr.write_kalibr,
-        poses=_ANY,
-        lenses=tuple(format_kalibr.KALIBR_LENSES),
+    CameraFormat("ros", format_opencv, "ROS camera_info, a file per camera", _ROS, poses=2),
+    CameraFormat("bag", format_bag, "ROS bag with camera_info and tf", _ROS, format_bag.SUFFIXES, _ANY),
+    CameraFormat(
+        "kalibr", format_kalibr, "Kalibr camchain", ("pinhole", "opencv4", "fisheye4"), poses=_ANY, lenses=_KALIBR,
         wide=True,
     ),
-    "basalt": CameraFormat(
-        title="Basalt calibration.json",
-        models=("pinhole", "opencv8", "fisheye4"),
-        read=format_kalibr.read_basalt,
-        write=format_kalibr.write_basalt,
-        poses=_ANY,
-        lenses=("ds", "eucm", "fov"),
-        wide=True,
+    CameraFormat(
+        "basalt", format_kalibr, "Basalt calibration.json", ("pinhole", "opencv8", "fisheye4"), poses=_ANY,
+        lenses=("ds", "eucm", "fov"), wide=True,
     ),
-    "mrcal": CameraFormat(
-        title="mrcal cameramodel, a file per camera",
-        suffixes=(".cameramodel",),
-        models=("pinhole", "opencv4", "opencv5", "opencv8", "opencv12"),
-        read=format_mrcal.read_mrcal,
-        write=format_mrcal.write_mrcal,
-        poses=_ANY,
-    ),
-    "colmap": CameraFormat(
-        title="COLMAP cameras.txt or cameras.bin with its rigs, or database",
-        suffixes=(".txt", ".bin"),
-        models=("pinhole", "opencv4", "opencv8", "fisheye4"),
-        read=format_photos.read_colmap,
-        write=format_photos.write_colmap,
-        poses=_ANY,
+    CameraFormat("mrcal", format_mrcal, "mrcal cameramodel, a file per camera", _MRCAL, (".cameramodel",), _ANY),
+    CameraFormat(
+        "colmap", format_photos, "COLMAP cameras.txt or cameras.bin with its rigs, or database",
+        ("pinhole", "opencv4", "opencv8", "fisheye4"), (".txt", ".bin"), _ANY,
         lenses=("rad-tan-thin-prism", "eucm", "fov", "division"),
     ),
-    "nerfstudio": CameraFormat(
-        title="nerfstudio transforms.json",
-        suffixes=(".json",),
-        models=("pinhole", "opencv4", "opencv5", "fisheye4"),
-        read=format_photos.read_nerfstudio,
-        write=format_photos.write_nerfstudio,
-        poses=0,
+    CameraFormat(
+        "nerfstudio", format_photos, "nerfstudio transforms.json", ("pinhole", "opencv4", "opencv5", "fisheye4"),
+        (".json",),
     ),
-    "matlab": CameraFormat(
-        title="MATLAB struct of camera or stereo parameters",
-        suffixes=(".mat",),
-        models=("pinhole", "opencv4", "opencv5"),
-        read=format_opencv.read_matlab,
-        write=format_opencv.write_matlab,
-        skew=True,
+    CameraFormat(
+        "matlab", format_opencv, "MATLAB struct of camera or stereo parameters", ("pinhole", "opencv4", "opencv5"),
+        (".mat",), 2, skew=True,
     ),
-    "opensfm": CameraFormat(
-        title="OpenSfM camera_models.json",
-        models=("pinhole", "opencv4", "opencv5", "fisheye4"),
-        read=format_photos.read_opensfm,
-        write=format_photos.write_opensfm,
+    CameraFormat(
+        "opensfm", format_photos, "OpenSfM camera_models.json", ("pinhole", "opencv4", "opencv5", "fisheye4"),
         lenses=("fisheye624",),
-        poses=0,
     ),
-    "toml": CameraFormat(
-        title="TOML of aniposelib, pose2sim and Caliscope; INI",
-        suffixes=(".toml",),
-        models=(*OPENCV_MODELS.values(), "fisheye4"),
-        read=format_opencv.read_toml,
-        write=format_opencv.write_toml,
-        poses=_ANY,
+    CameraFormat("toml", format_opencv, "TOML of aniposelib, pose2sim and Caliscope; INI", _OPENCV, (".toml",), _ANY),
+    CameraFormat("multical", format_opencv, "multical calibration.json", tuple(OPENCV_MODELS.values()), poses=_ANY),
+    CameraFormat("calibio", format_opencv, "calib.io JSON"),
+    CameraFormat("qualisys", format_photos, "Qualisys .qca.txt"),
+    CameraFormat("agisoft", format_photos, "Agisoft Metashape XML"),
+    CameraFormat("device", format_devices, _DEVICES),
+    CameraFormat(
+        "gtsam", format_prior, "Values and noise model for GTSAM, JSON", format_prior.GTSAM_MODELS, skew=True,
+        prior=True,
     ),
-    "multical": CameraFormat(
-        title="multical calibration.json",
-        models=tuple(OPENCV_MODELS.values()),
-        read=format_opencv.read_multical,
-        write=format_opencv.write_multical,
-        poses=_ANY,
+    CameraFormat("ceres", format_prior, "A and b of Ceres's NormalPrior, JSON", format_prior.PLAIN_MODELS, prior=True),
+    CameraFormat(
+        "numpy", format_prior, "Parameters and their square-root information, .npz", format_prior.PLAIN_MODELS,
+        prior=True,
     ),
-    "calibio": CameraFormat(title="calib.io JSON", models=(), read=format_opencv.read_calibio, poses=0),
-    "qualisys": CameraFormat(title="Qualisys .qca.txt", models=(), read=format_photos.read_qualisys, poses=0),
-    "agisoft": CameraFormat(title="Agisoft Metashape XML", models=(), read=format_photos.read_agisoft, poses=0),
-    "device": CameraFormat(
-        title="depthai, Azure Kinect, RealSense, ZED, EuRoC, KITTI, Open3D, nuScenes, photos of DJI's drones",
-        models=(),
-        read=format_devices.read_device,
-        poses=0,
-    ),
-    "gtsam": _prior_format("gtsam", "Values and noise model for GTSAM, JSON", format_prior.GTSAM_MODELS),
-    "ceres": _prior_format("ceres", "A and b of Ceres's NormalPrior, JSON", format_prior.PLAIN_MODELS),
-    "numpy": _prior_format("numpy", "Parameters and their square-root information, .npz", format_prior.PLAIN_MODELS),
-}
+)  # fmt: skip
+FORMATS = {known.name: known for known in _LIST}
 
 
 def format_named(name: str) -> CameraFormat:

@@ -291,9 +291,7 @@ def _camera(named: _Named, side: str, name: str, hints: Hints, notes: list[str])
     if named.get("xi", side) is not None:
         if len(lens) != 4 or skew:
             raise ValueError("an omnidir camera has 4 coefficients and, here, no skew")
-        camera, note = foreign_camera("omni-radtan", name, core, size, [named.number("xi", side), *lens])
-        notes.append(note)
-        return camera
+        return foreign_camera("omni-radtan", name, core, size, [named.number("xi", side), *lens], notes)
     if fisheye and lens and len(lens) != 4:
         raise ValueError(f"a fisheye has 4 coefficients, {key} has {len(lens)}")
     lens = numbers(lens, (4,) if fisheye and lens else tuple(OPENCV_MODELS), key)
@@ -321,21 +319,19 @@ def _realsense_lens(kind: str, like: Camera, lens: list[float], notes: list[str]
         if kind == "fov" and any(lens[1:]):
             raise ValueError("ftheta with more than one coefficient, which is not RealSense's: kcal does not read it")
         own = lens[:1] if kind == "fov" else lens
-        camera, note = foreign_camera(kind, name, like.params[:4].tolist(), like.size, own)
-        notes.append(note)
-        return camera
+        return foreign_camera(kind, name, like.params[:4].tolist(), like.size, own, notes)
     straight = Camera.build(focal=(1, 1), center=(0, 0), size=(2, 2), coefficients=lens, model="opencv5")
 
     def rays(pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         found, good = straight.project(pad(like.normalize(pixels)[0], (0, 1), value=1.0))
         return pad(found, (0, 1), value=1.0), good
 
-    camera, note = nearest_hybrid(rays, like, "its inverse_brown_conrady lens")
+    camera = nearest_hybrid(rays, like, "its inverse_brown_conrady lens", notes)
     corner = torch.tensor(like.size, dtype=torch.float64)[None] - 1.0
     off = 2.0 * float((like.project(rays(corner)[0])[0] - corner).norm())
-    notes += [note, f"{name}: inverse_brown_conrady is read as RealSense documents it, from distorted points to rays; "
-              "librealsense computes it as modified_brown_conrady since version 2.45, some "
-              f"{off:.2g} px away in a corner: write that name into the file if it is meant"]  # fmt: skip
+    notes.append(f"{name}: inverse_brown_conrady is read as RealSense documents it, from distorted points to rays; "
+                 "librealsense computes it as modified_brown_conrady since version 2.45, some "
+                 f"{off:.2g} px away in a corner: write that name into the file if it is meant")  # fmt: skip
     return camera
 
 

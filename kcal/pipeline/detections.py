@@ -33,29 +33,18 @@ _KEYS = {"time", "size", "boxes", "scores", "categories", "tracks", "keypoints"}
 _AROUND_KEYPOINT = 8.0
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RawDetections:
-    """Detections as their source counts pixels; `centered`: its keypoints are at pixel centers already."""
-
-    boxes: Tensor
-    score: Tensor | None = None
-    category: Sequence[str | int | float] | None = None
-    track: Sequence[object] | None = None
-    keypoints: Tensor | None = None
-    masks: Tensor | None = None
-    size: tuple[int, int] | None = None
-    time: float | None = None
-    names: Mapping[int, str] | None = None
-    centered: bool = False
+# What a source has, as it counts pixels: `boxes`, and, if there are any, `score`, `category`, `track`, `keypoints`,
+# `masks`, `size`, `time` as in `Detections`; `names` of categories; `centered`: keypoints count from pixel centers.
+Raw = dict[str, Any]
 
 
-def raw_detections(source: Any) -> RawDetections:
+def _raw_detections(source: Any) -> Raw:
     """What a detector returned, whichever it is; see `Detections.read`.
 
     Raises:
         InputError: nothing that is known, or values that are no detections.
     """
-    readers: list[tuple[bool, Callable[[Any], RawDetections]]] = [
+    readers: list[tuple[bool, Callable[[Any], Raw]]] = [
         (isinstance(source, (str, bytes)), _from_json),
         (isinstance(source, Mapping), _from_dict),
         (hasattr(source, "xyxy") and hasattr(source, "tracker_id"), _from_supervision),
@@ -99,27 +88,27 @@ def _plain_list(values: Any) -> list | None:
     return None if values is None else [value.item() if hasattr(value, "item") else value for value in values]
 
 
-def _from_array(source: Any) -> RawDetections:
+def _from_array(source: Any) -> Raw:
     table = _as_numbers("boxes", source)
     if table.numel() == 0:
-        return RawDetections(boxes=table.reshape(0, 4))
+        return dict(boxes=table.reshape(0, 4))
     if table.ndim != 2 or not 4 <= table.shape[1] <= 6:
         raise InputError(
             f"detections: shape (N, 4) to (N, 6) of x1, y1, x2, y2, score, class is needed, got {tuple(table.shape)}"
         )
-    return RawDetections(
+    return dict(
         boxes=table[:, :4],
         score=table[:, 4] if table.shape[1] > 4 else None,
         category=table[:, 5].tolist() if table.shape[1] > 5 else None,
     )
 
 
-def _from_dict(source: Mapping[str, Any]) -> RawDetections:
+def _from_dict(source: Mapping[str, Any]) -> Raw:
     """Of torchvision; `labels` may be names."""
     if "boxes" not in source:
         raise InputError(f"detections: the dictionary has no boxes, only {', '.join(map(str, source))}")
     keypoints = _optional(source.get("keypoints"), "keypoints")
-    return RawDetections(
+    return dict(
         boxes=_boxes(source["boxes"]),
         score=_optional(source.get("scores"), "scores"),
         category=_plain_list(source.get("labels")),
@@ -129,7 +118,7 @@ def _from_dict(source: Mapping[str, Any]) -> RawDetections:
     )
 
 
-def _from_json(source: str | bytes) -> RawDetections:
+def _from_json(source: str | bytes) -> Raw:
     try:
         line = orjson.loads(source)
     except orjson.JSONDecodeError as error:
@@ -149,7 +138,7 @@ def _from_json(source: str | bytes) -> RawDetections:
     tracks = line.get("tracks")
     if tracks is not None and not isinstance(tracks, list):
         raise InputError(f"detections: tracks must be a list, got {tracks!r}")
-    return RawDetections(
+    return dict(
         boxes=_boxes(line["boxes"]),
         score=_optional(line.get("scores"), "scores"),
         category=categories,
@@ -160,12 +149,12 @@ def _from_json(source: str | bytes) -> RawDetections:
     )
 
 
-def _from_supervision(source: Any) -> RawDetections:
+def _from_supervision(source: Any) -> Raw:
     """`supervision.Detections`; class names come from its `data`."""
     names = (source.data or {}).get("class_name")
     category = names if names is not None else source.class_id
     masks = source.mask
-    return RawDetections(
+    return dict(
         boxes=_boxes(source.xyxy),
         score=_optional(source.confidence, "confidence"),
         category=_plain_list(category),
@@ -175,7 +164,7 @@ def _from_supervision(source: Any) -> RawDetections:
     )
 
 
-def _from_ultralytics(source: Any) -> RawDetections:
+def _from_ultralytics(source: Any) -> Raw:
     """One `Results` of ultralytics, or what has the same attributes; its boxes are in the original image."""
     boxes = source.boxes
     height, width = source.orig_shape[:2]
@@ -186,7 +175,7 @@ def _from_ultralytics(source: Any) -> RawDetections:
         whole = torch.as_tensor(masks.data) > 0.5
         if tuple(whole.shape[1:]) != (height, width):
             whole = None  # in the letterboxed input: to be read with retina_masks=True
-    return RawDetections(
+    return dict(
         boxes=_boxes(boxes.xyxy),
         score=_optional(boxes.conf, "conf"),
         category=_plain_list(boxes.cls),
@@ -198,17 +187,17 @@ def _from_ultralytics(source: Any) -> RawDetections:
     )
 
 
-def _from_kornia_boxes(source: Any) -> RawDetections:
+def _from_kornia_boxes(source: Any) -> Raw:
     """`Boxes`: its exclusive xyxy counts from the first pixel's edge."""
-    return RawDetections(boxes=_one_image(source.to_tensor("xyxy")))
+    return dict(boxes=_one_image(source.to_tensor("xyxy")))
 
 
-def _from_kornia_keypoints(source: Any) -> RawDetections:
+def _from_kornia_keypoints(source: Any) -> Raw:
     """`Keypoints` (N, 2): one for each object, with a small box around it."""
     points = _one_image(source.to_tensor())
     edges = points + 0.5
     boxes = torch.cat([edges - _AROUND_KEYPOINT, edges + _AROUND_KEYPOINT], -1)
-    return RawDetections(boxes=boxes, keypoints=points[:, None], centered=True)
+    return dict(boxes=boxes, keypoints=points[:, None], centered=True)
 
 
 def _one_image(values: Tensor) -> Tensor:
@@ -323,27 +312,27 @@ class Detections:
             >>> Detections.read(line).category
             ('ship',)
         """
-        raw = raw_detections(source)
-        count = len(raw.boxes)
-        image_size = size or raw.size
-        if image_size is None:
+        raw = _raw_detections(source)
+        stated, boxes, masks, keypoints = raw.get("size"), raw["boxes"], raw.get("masks"), raw.get("keypoints")
+        whole = size or stated
+        if whole is None:
             raise InputError("detections: the image's size is needed; give size=(width, height)")
-        if size is not None and raw.size is not None and tuple(size) != tuple(raw.size):
-            raise InputError(f"detections: size {tuple(size)} was given, the source says {tuple(raw.size)}")
-        masks = raw.masks
-        if masks is not None and masks.dtype != torch.bool:
-            masks = masks > 0.5  # torchvision's are probabilities
-        if masks is not None and masks.ndim == 4:
-            masks = masks[:, 0]
+        if size is not None and stated is not None and tuple(size) != tuple(stated):
+            raise InputError(f"detections: size {tuple(size)} was given, the source says {tuple(stated)}")
+        if masks is not None:
+            masks = masks if masks.dtype == torch.bool else masks > 0.5  # torchvision's are probabilities
+            masks = masks[:, 0] if masks.ndim == 4 else masks
+        score, known = raw.get("score"), {**(raw.get("names") or {}), **(names or {})}
+        categories = ["object"] * len(boxes) if raw.get("category") is None else raw["category"]
         return cls(
-            boxes=raw.boxes - first_pixel,
-            score=torch.ones_like(raw.boxes[:, 0]).detach() if raw.score is None else raw.score,
-            category=_category_names(raw, count, names or {}),
-            track=tuple(None if track is None else str(track) for track in raw.track or (None,) * count),
-            keypoints=None if raw.keypoints is None else raw.keypoints - (0.0 if raw.centered else first_pixel),
+            boxes=boxes - first_pixel,
+            score=torch.ones_like(boxes[:, 0]).detach() if score is None else score,
+            category=tuple(one if isinstance(one, str) else known.get(int(one), str(int(one))) for one in categories),
+            track=tuple(None if one is None else str(one) for one in raw.get("track") or (None,) * len(boxes)),
+            keypoints=None if keypoints is None else keypoints - (0.0 if raw.get("centered") else first_pixel),
             masks=masks,
-            size=(int(image_size[0]), int(image_size[1])),
-            time=raw.time if time is None else time,
+            size=(int(whole[0]), int(whole[1])),
+            time=raw.get("time") if time is None else time,
         )
 
     def to(self, device: torch.device | str) -> Detections:
@@ -417,16 +406,6 @@ def box_anchors(boxes: Tensor, anchor: str) -> Tensor:
     if anchor not in ("center", "bottom"):
         raise InputError(f"anchor {anchor!r}: 'center', 'bottom' or the number of a keypoint is needed")
     return torch.stack([0.5 * (left + right), bottom if anchor == "bottom" else 0.5 * (top + bottom)], -1)
-
-
-def _category_names(raw: RawDetections, count: int, names: dict[int, str]) -> tuple[str, ...]:
-    if raw.category is None:
-        return ("object",) * count
-    known = {**(raw.names or {}), **names}
-    return tuple(
-        category if isinstance(category, str) else known.get(int(category), str(int(category)))
-        for category in raw.category
-    )
 
 
 # Call a user's detector, `package.module:callable`, on frames, and say in one line what is wrong with it.

@@ -14,7 +14,6 @@ from kcal.errors import InputError
 from kcal.lens.camera_like import CameraStack, camera_stack, project_stack, unproject_each
 from kcal.lens.pose import side_axes
 from kcal.locate.angular import LIGHT_HORIZON, Found, baseline_axes, first_seen, meeting_points, triangulate_angular
-from kcal.locate.localizer import Localizer
 from kcal.locate.views import CommonErrors, PosedCameras, sound_covariances
 from kcal.texts import briefly
 
@@ -351,11 +350,6 @@ class Sightings(NamedTuple):
         return type(self)(*(value.index_select(-1, which) for value in self))
 
 
-def known_sightings(localize: Localizer) -> KnownViews:
-    """What `sightings` needs of a rig; the calibration's errors are those that `localize` includes."""
-    return known_views(localize.posed, localize.common)
-
-
 @torch.no_grad()
 def sightings(
     known: KnownViews,
@@ -368,7 +362,7 @@ def sightings(
     """Measure objects of one time step.
 
     Args:
-        known: from `known_sightings`.
+        known: from `known_views`, with the errors that a `Localizer` includes.
         pixels: (N, V, 2), and what follows: as in `ObjectViews`.
         seen: (N, V) bool.
         covariance: (N, 2 V, 2 V).

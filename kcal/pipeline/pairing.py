@@ -493,13 +493,7 @@ class ObjectDisparity(StatedModule):
             beyond = patches.grid_of((objects.half + 1,) * 2, device)
             places, _ = patches.plane_pixels(rig.right, planes, start[:, None, None] + step * beyond, rotation)
             moved = places[:, 1:-1, 1:-1]
-            slopes = torch.stack(
-                [
-                    0.5 * (places[:, 1:-1, 2:] - places[:, 1:-1, :-2]),
-                    0.5 * (places[:, 2:, 1:-1] - places[:, :-2, 1:-1]),
-                ],
-                -1,
-            )
+            slopes = patches.slopes_of(places)
             saturated |= (patches.sample(second, moved, saturated=True) > 0.02) & (base > 0)
             weight = torch.where(saturated | ~patches.has_samples(second, moved), 0.0, base)
             wanted, named = patches.plane_places(rig.left, planes, objects.anchors)
@@ -523,9 +517,7 @@ class ObjectDisparity(StatedModule):
             at = objects.half
             middle = slopes[:, at, at]
             covariance = middle @ fit.covariance @ middle.mT
-            own = 0.5 * torch.stack(
-                [here[:, at, at + 1] - here[:, at, at - 1], here[:, at + 1, at] - here[:, at - 1, at]], -1
-            )
+            own = patches.slopes_of(here[:, at - 1 : at + 2, at - 1 : at + 2])[:, 0, 0]
             by_anchor = middle @ torch.linalg.inv_ex(own)[0]
             off_line = (column[:, 1] / planes.step).abs() * 2**level
             sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()

@@ -8,9 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Self, TypeAlias
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 import kcal.pipeline.imm_filter as imm
@@ -181,7 +179,7 @@ def track_steps(localize: Localizer, lasting_px: float) -> TrackSteps:
     """The steps as they are."""
     centers, errors, bending = localize.rig.center, localize.errors, localize.bending_errors
     turned = None if errors is None else errors[:, :, 3:6].movedim(-1, 0)
-    cameras, known = SeenFrom(centers, turned), measured.known_sightings(localize)
+    cameras, known = SeenFrom(centers, turned), measured.known_views(localize.posed, localize.common)
     k = float(known.posed.bending)
 
     def measure(pixels: Tensor, seen: Tensor, covariance: Tensor, time: Tensor) -> Sightings:
@@ -515,7 +513,7 @@ class Tracker:
 
     def _take(self, views: ObjectViews, seen: Sightings) -> None:
         timing, marks = self._delays(seen), mark_numbers(views.pixels, views.seen)
-        ends = [_mark_set(row) for row in marks]
+        ends: list[_Ends] = [{(c, mark) for c, mark in enumerate(row) if mark >= 0} for row in marks.tolist()]
         several = views.seen.sum(1) > 1
         numbers = torch.arange(len(views))
         used: _Ends = set()
@@ -664,10 +662,6 @@ class Tracker:
         distance = measured.mahalanobis(here.noise + old.noise + measured.squared(spread), here.mean - old.mean)[0][0]
         near = [i for i, value in zip(lost, distance.tolist(), strict=True) if value <= self.options.recognize]
         return near[0] if len(near) == 1 else None
-
-
-def _mark_set(row: NDArray[np.int64]) -> _Ends:
-    return {(camera, mark) for camera, mark in enumerate(row.tolist()) if mark >= 0}
 
 
 def _toward(aim: Tensor) -> Tensor:

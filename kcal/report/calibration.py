@@ -428,8 +428,8 @@ def _order(views: Sequence[View]) -> tuple[list[int], int]:
     """Indices of the views that stand out, the worst first, then of the others in their order; how many stand out."""
     sigmas = [_predicted_sigma(view) or 0.0 for view in views]
     limit = _STANDS_OUT * float(np.median(sigmas)) if sigmas else 0.0
-    out = [i for i, view in enumerate(views) if view.pixels.count(None) or sigmas[i] > limit > 0]
-    out.sort(key=lambda i: (views[i].pixels.count(None), sigmas[i]), reverse=True)
+    out = [i for i, view in enumerate(views) if not view.seen.all() or sigmas[i] > limit > 0]
+    out.sort(key=lambda i: (int((~views[i].seen).sum()), sigmas[i]), reverse=True)
     return [*out, *(i for i in range(len(views)) if i not in out)], len(out)
 
 
@@ -450,11 +450,11 @@ def _draw_tile(axes: Axes, path: str | Path | None, size: tuple[int, int], title
 
 
 def _draw_view(axes: Axes, observations: Observations, view: View) -> None:
-    sigma, unseen = _predicted_sigma(view), view.pixels.count(None)
+    sigma, unseen = _predicted_sigma(view), int((~view.seen).sum())
     text = shortened(view.name, 34) + (f"  σ {sigma:.3f} px" if sigma is not None else "")
     text += f"  {unseen} left out" if unseen else ""
     _draw_tile(axes, view.image, observations.image_size, text, WARN if unseen else INK)
-    places = np.array([(math.nan, math.nan) if pixel is None else pixel for pixel in view.pixels])
+    places = view.places
     axes.plot(*places[: observations.board.columns].T, color=ACCENT, linewidth=1.2)
     axes.scatter(places[:, 0], places[:, 1], s=9, color=WARN, linewidths=0)
     axes.scatter(places[:1, 0], places[:1, 1], s=60, facecolors="none", edgecolors=ACCENT, linewidths=1.6)

@@ -133,7 +133,7 @@ def stations_blocks(rig: Rig) -> Blocks:
 
 def observations_blocks(seen: Observations) -> Blocks:
     """Board, images, and those without a board."""
-    counts = [sum(pixel is not None for pixel in view.pixels) for view in seen.views]
+    counts = [int(view.seen.sum()) for view in seen.views]
     width, height = seen.image_size
     yield f"board {seen.board}; images {width}x{height} px; refinement {seen.refinement}"
     yield f"{len(counts)} views with {sum(counts)} corners, {len(seen.failures)} images without"

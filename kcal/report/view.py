@@ -318,7 +318,7 @@ class _Recorded:
                 if view is None or not bool(rms[view].isfinite()):
                     continue
                 corners = (one.board.points @ poses.rotation[view].T + poses.translation[view]).numpy()
-                there = [pixel is not None for pixel in one.views[view].pixels]
+                there = one.views[view].seen
                 color, text = _CAMERAS[camera % len(_CAMERAS)], f"{name}: {float(rms[view]):.3f} px"
                 # Through the corners that are outermost toward each corner of the board.
                 x, y = one.board.points[:, 0], one.board.points[:, 1]

@@ -225,7 +225,6 @@ def drawn_lens(
     strength: float,
     seed: int,
     *,
-    focal: float | None = None,
     focal_mm: float = 2.8,
     wander: float = 0.1,
     scale: float = 1.0,
@@ -240,7 +239,6 @@ def drawn_lens(
         prescription: of the lens.
         strength: of the misalignment.
         seed: of its draw.
-        focal: in pixels; the prescription's own if left out.
         focal_mm: see `TruthLens`.
         wander: see `TruthLens`.
         scale: of the image of 1920 x 1080 px, with the same lens and field of view; smaller for quick tests.
@@ -257,7 +255,7 @@ def drawn_lens(
     size = round(1920 * scale), round(1080 * scale)
     return TruthLens(
         prescription,
-        focal=scale * (prescription.focal if focal is None else focal),
+        focal=scale * prescription.focal,
         size=size,
         focal_mm=focal_mm,
         center=(0.5 * (size[0] - 1) + scale * _AXIS * shift[0], 0.5 * (size[1] - 1) + scale * _AXIS * shift[1]),

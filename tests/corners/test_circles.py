@@ -48,11 +48,11 @@ def test_centers_of_tilted_boards(papers, board, distance, tilt):
 def test_the_center_of_the_ellipse_is_not_the_center_of_the_circle(papers, board, distance, monkeypatch):
     """What the correction is worth where the board is tilted by 45 degrees: measured, beside OpenCV's centers."""
     image, truth = papers[board].shoot(CAMERA, *pose(board, [0.8, 0.0, 0.0], distance))
-    found = find_circles(image, board)
-    corrected, _ = refine_circles(image, found.pixels, board, found.radius)
+    found, radius = find_circles(image, board)
+    corrected, _ = refine_circles(image, found, board, radius)
     monkeypatch.setattr("kcal.corners.circles.center_shift", lambda maps, radius: torch.zeros(board.corners, 2))
-    ellipses, _ = refine_circles(image, found.pixels, board, found.radius)
-    opencv, plain, right = (errors(pixels, truth)[0] for pixels in (found.pixels, ellipses.pixels, corrected.pixels))
+    ellipses, _ = refine_circles(image, found, board, radius)
+    opencv, plain, right = (errors(pixels, truth)[0] for pixels in (found, ellipses.pixels, corrected.pixels))
     assert right < 0.01
     assert plain > 0.04  # 0.05 to 0.1 px, all in the direction in which the board falls away
     assert opencv > plain
@@ -97,8 +97,8 @@ def test_shift_that_a_lens_makes():
 
 def test_diameter_is_measured_or_checked(papers):
     image, truth = papers[CIRCLES].shoot(CAMERA, *pose(CIRCLES, [0.5, 0.2, 0.1], 0.32))
-    found = find_circles(image, CIRCLES)
-    _, radius = refine_circles(image, found.pixels, CIRCLES, found.radius)
+    found, about = find_circles(image, CIRCLES)
+    _, radius = refine_circles(image, found, CIRCLES, about)
     assert radius == pytest.approx(0.0055, rel=0.01)
     told = Board.parse("circles:8x6:11mm", "22mm")
     assert errors(detect_board(image, told).pixels, truth)[0] < 0.01
@@ -215,7 +215,7 @@ def test_circles_that_tell_how_others_are_shifted(known, corrected, monkeypatch)
     board = Board.parse("circles:4x3", "30mm")
     lens = Camera.build(focal=(200, 200), center=(100, 75), size=(200, 150), model="pinhole")
     image, _ = Paper(board, cell_mm=0.5).shoot(lens, *pose(board, [0.7, 0.0, 0.0], 0.2))
-    found = find_circles(image, board)
+    found, radius = find_circles(image, board)
 
     def some_good(*arguments):
         refined = _with_statuses(*arguments)
@@ -224,7 +224,7 @@ def test_circles_that_tell_how_others_are_shifted(known, corrected, monkeypatch)
         return refined._replace(status=status, pixels=arguments[2].center)
 
     monkeypatch.setattr("kcal.corners.circles._with_statuses", some_good)
-    moved, _ = refine_circles(image, found.pixels, board, found.radius)
+    moved, _ = refine_circles(image, found, board, radius)
     monkeypatch.setattr("kcal.corners.circles.center_shift", lambda maps, radius: torch.zeros(board.corners, 2))
-    centers, _ = refine_circles(image, found.pixels, board, found.radius)
+    centers, _ = refine_circles(image, found, board, radius)
     assert (float((moved.pixels - centers.pixels).abs().max()) > 0.01) is corrected

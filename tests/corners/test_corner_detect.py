@@ -361,7 +361,7 @@ def test_square_boards(count, degrees):
     if count % 2 == 0:  # all four corners look alike: nearest to upright
         assert abs(lean) <= 45 + 1e-6
     else:  # two of four have a dark outer square
-        assert first_square_dark(image, results[0], count, count)[0]
+        assert first_square_dark(image, results[0].reshape(count, count, 2))[0]
         assert abs(lean) <= 90 + 1e-6
 
 
@@ -389,13 +389,13 @@ def test_local_side():
 def test_cell_levels_and_first_square():
     board = Board(columns=5, rows=4, square=0.02)
     image, truth = flat(board, 10)
-    levels = cell_levels(image, truth, 5, 4)
+    levels = cell_levels(image, truth.reshape(4, 5, 2))
     assert levels.shape == (3, 4)
     assert float(levels[0, 0]) == pytest.approx(40, abs=3)  # dark gray of the renderer, noise 1
     assert float(levels[0, 1]) == pytest.approx(215, abs=3)
-    assert first_square_dark(image, truth, 5, 4) == (True, 1.0)
+    assert first_square_dark(image, truth.reshape(4, 5, 2)) == (True, 1.0)
     light_first, _ = flat(board, 10, dark_first=False)
-    assert first_square_dark(light_first, truth, 5, 4) == (False, 1.0)
+    assert first_square_dark(light_first, truth.reshape(4, 5, 2)) == (False, 1.0)
 
 
 @pytest.mark.parametrize("degrees", [0, 40, 180])
@@ -429,7 +429,7 @@ def test_the_whole_board_is_accepted_on_any_background(surround, tilt):
     for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, 0), strict=True):
         inside &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0
     image[~inside] = surround
-    assert not goes_on(image, truth, 7, 6)
+    assert not goes_on(image, truth.reshape(6, 7, 2))
     assert grid_trouble(image, truth, 7, 6) is None
 
 
@@ -568,7 +568,7 @@ def test_the_edge_of_the_paper_is_no_line_of_corners():
     board = Board(columns=8, rows=6, square=0.025)
     image, truth = picture(board)
     grid = truth.reshape(6, 8, 2)
-    assert not bool(false_sides(image, truth, 8, 6).any())
+    assert not bool(false_sides(image, truth.reshape(6, 8, 2)).any())
     longer = torch.cat([grid, (2 * grid[:, -1:] - grid[:, -2:-1])], 1)
     # Dark ground begins a tenth of a square outside the outer squares.
     out = (longer[:, -1] - longer[:, -2]).mean(0)
@@ -578,15 +578,15 @@ def test_the_edge_of_the_paper_is_no_line_of_corners():
         [ends[0] - 4 * down, ends[-1] + 4 * down, ends[-1] + 4 * down + 6 * out, ends[0] - 4 * down + 6 * out]
     )
     cv2.fillPoly(image, [area.round().int().numpy()], 50)
-    assert false_sides(image, longer.reshape(-1, 2), 9, 6).tolist() == [False, False, False, True]
+    assert false_sides(image, longer).tolist() == [False, False, False, True]
     assert without_false_sides(image, longer).shape == (6, 8, 2)
 
 
 def test_every_other_line_is_noticed():
     image, truth = picture()
-    assert not skips(image, truth, 9, 6)
-    assert skips(image, truth.reshape(6, 9, 2)[:5:2].reshape(-1, 2), 9, 3)
-    assert skips(image, truth.reshape(6, 9, 2)[:, ::2].reshape(-1, 2), 5, 6)
+    assert not skips(image, truth.reshape(6, 9, 2))
+    assert skips(image, truth.reshape(6, 9, 2)[:5:2])
+    assert skips(image, truth.reshape(6, 9, 2)[:, ::2])
 
 
 def test_sharpened_edges_lose_no_corners():

@@ -28,6 +28,7 @@ from kcal.corners.observations import View, common_size, rescaled, resized_alike
 from kcal.corners.recognize import has_own_markers, seen_circles, seen_instead, seen_markers, seen_size
 from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
+from kcal.corners.search import NotFoundError
 from kcal.corners.video import VideoFrames
 from kcal.errors import FileError, InputError
 
@@ -415,8 +416,9 @@ class TestOtherBoards:
         assert seen_circles(twelve, Board.parse("circles:4x3", "25mm")) == ""
         other = seen_circles(twelve, Board.parse("asymmetric:4x4", "25mm"))
         assert other.startswith("some 12 circles were found, the board has 16")
-        few = find_circles(twelve, Board.parse("circles:7x6", "25mm")).reason
-        assert few == "no grid of 7x6 circles found (12 round blobs seen, 42 are needed, all in the image)"
+        few = r"no grid of 7x6 circles found \(12 round blobs seen, 42 are needed, all in the image\)"
+        with pytest.raises(NotFoundError, match=few):
+            find_circles(twelve, Board.parse("circles:7x6", "25mm"))
 
     def test_the_size_of_a_grid(self) -> None:
         i, j = np.mgrid[:9, :6]

@@ -28,12 +28,13 @@ from kcal.corners.grid import (
     _bend,
     _beyond,
     _change,
-    _contrast,
     _corner_areas,
     _curvature,
     _ratio,
     _smooth,
     cell_levels,
+    checkered,
+    contrast,
     false_sides,
     first_square_dark,
     goes_on,
@@ -49,13 +50,12 @@ from kcal.corners.marker_boards import in_place, inliers
 from kcal.corners.patches import highest_peak, is_textured, weighted_correlation
 from kcal.corners.recognize import like_sized, smallest
 from kcal.corners.search import (
-    _factors,
     _predicted,
-    checkered,
     filled_grid,
     grown_grid,
     local_steps,
     reduced,
+    search_sizes,
     to_full_size,
 )
 from kcal.corners.video import Frame, _sharpness, is_new_view, sharpest
@@ -112,13 +112,13 @@ class TestGrid:
         after, before = levels_beside(image, grid[0, 0], along, down)
         # The square outside the first corner is dark, so is the one inside.
         assert (float(after), float(before)) == (20.0, 220.0)
-        assert float(_contrast(image, grid[0, 0], along, down)) == pytest.approx(-400.0)
-        assert float(_contrast(image, grid[0, 1], along, down)) == pytest.approx(400.0)
-        cells = cell_levels(image, grid.reshape(-1, 2), 5, 4)
+        assert float(contrast(image, grid[0, 0], along, down)) == pytest.approx(-400.0)
+        assert float(contrast(image, grid[0, 1], along, down)) == pytest.approx(400.0)
+        cells = cell_levels(image, grid)
         assert cells[0, 0] == 20.0
         assert cells[0, 1] == cells[1, 0] == 220.0
-        assert first_square_dark(image, grid.reshape(-1, 2), 5, 4) == (True, 1.0)
-        assert first_square_dark(255 - image, grid.reshape(-1, 2), 5, 4) == (False, 1.0)
+        assert first_square_dark(image, grid) == (True, 1.0)
+        assert first_square_dark(255 - image, grid) == (False, 1.0)
         outside = levels_at(image, torch.tensor([[-9.0, 3.0], [1e4, 1e4], [math.nan, 0.0]]))
         assert outside[:2].tolist() == [220.0, 220.0]
         assert math.isnan(outside[2])
@@ -127,24 +127,24 @@ class TestGrid:
     def test_sharpness_of_blurred_squares(self, share: float, expected: float) -> None:
         image, grid = squares(8, 7)
         blurred = cv2.GaussianBlur(image.astype(np.float64), (0, 0), share * SQUARE)
-        assert sharpness(image, grid.reshape(-1, 2), 7, 6) == pytest.approx(1.0)
-        assert sharpness(blurred, grid.reshape(-1, 2), 7, 6) == pytest.approx(expected, abs=0.03)
+        assert sharpness(image, grid) == pytest.approx(1.0)
+        assert sharpness(blurred, grid) == pytest.approx(expected, abs=0.03)
 
     def test_parts_of_a_board_are_told(self) -> None:
         image, grid = squares(8, 7)
         whole = grid.reshape(-1, 2)
         assert grid_trouble(image, whole, 7, 6) is None
-        assert not goes_on(image, whole, 7, 6)
-        assert not skips(image, whole, 7, 6)
+        assert not goes_on(image, whole.reshape(6, 7, 2))
+        assert not skips(image, whole.reshape(6, 7, 2))
         for part in (grid[:-1], grid[1:], grid[:, :-1], grid[:, 1:]):
             rows, columns = part.shape[:2]
-            assert goes_on(image, part.reshape(-1, 2), columns, rows)
+            assert goes_on(image, part)
             trouble = grid_trouble(image, part.reshape(-1, 2), columns, rows)
             assert trouble is not None
             assert "go on beyond" in trouble
         every_other = grid[::2]
-        assert skips(image, every_other.reshape(-1, 2), 7, 3)
-        assert skips(image, grid[:, ::2].reshape(-1, 2), 4, 6)
+        assert skips(image, every_other)
+        assert skips(image, grid[:, ::2])
 
     def test_the_edge_of_the_board_is_no_line_of_corners(self) -> None:
         """On dark ground the outer edge looks like another line."""
@@ -152,12 +152,12 @@ class TestGrid:
         image[:30], image[-30:], image[:, :30], image[:, -30:] = 20, 20, 20, 20
         step = torch.tensor([0.0, 20.0]).double()
         for line, side in ((torch.cat([grid[:1] - step, grid]), 0), (torch.cat([grid, grid[-1:] + step]), 1)):
-            found = false_sides(image, line.reshape(-1, 2), 7, 7)
+            found = false_sides(image, line)
             assert found.tolist() == [k == side for k in range(4)]
             kept = without_false_sides(image, line)
             assert kept is not None
             torch.testing.assert_close(kept, grid)
-        assert not false_sides(image, grid.reshape(-1, 2), 7, 6).any()
+        assert not false_sides(image, grid).any()
 
     def test_lines_on_circles(self) -> None:
         angle = torch.linspace(-0.2, 0.2, 5, dtype=torch.float64)
@@ -418,9 +418,9 @@ class TestSizes:
         assert to_full_size(torch.zeros(2).double(), scale).tolist() == [0.5, 0.5]
         same, scale = reduced(image, 1.0, (40, 30))
         assert same is image
-        assert _factors(np.zeros((3600, 10), np.uint8)) == [3.0, 1.5]
-        assert _factors(np.zeros((900, 1200), np.uint8)) == [1.0]
-        assert _factors(np.zeros((900, 2000), np.uint8)) == [2000 / 1200, 1.0]
+        assert [factor for factor, _, _ in search_sizes(np.zeros((3600, 10), np.uint8))] == [3.0, 1.5]
+        assert [factor for factor, _, _ in search_sizes(np.zeros((900, 1200), np.uint8))] == [1.0]
+        assert [factor for factor, _, _ in search_sizes(np.zeros((900, 2000), np.uint8))] == [2000 / 1200, 1.0]
 
     def test_sizes_of_circles(self) -> None:
         board = Board.parse("circles:7x6:10mm", "20mm")

@@ -23,7 +23,6 @@ from kcal.corners.search import (
     _grown,
     _hidden_sides,
     _placements,
-    _symmetries,
     board_ends,
     filled_grid,
     grown_grid,
@@ -69,13 +68,13 @@ class TestWholeBoards:
             signs[0] *= share
             image, grid = seen_from(turn, *picture(signs))
             part = (grid[1:], grid[:-1], grid[:, 1:], grid[:, :-1])[turn]
-            assert goes_on(image, part.reshape(-1, 2), part.shape[1], part.shape[0]) is more
+            assert goes_on(image, part) is more
         # Where most of that row is outside of the image nothing goes on.
         signs = alternating(7, 6)
         image, grid = picture(signs, margin=0)
         part, cut = grid[1:] - torch.tensor([0.0, 15.0]), image[15:]
-        assert not goes_on(cut, part.reshape(-1, 2), 5, 5)
-        assert goes_on(image, grid[1:].reshape(-1, 2), 5, 5)
+        assert not goes_on(cut, part)
+        assert goes_on(image, grid[1:])
 
     @pytest.mark.parametrize("turn", range(4))
     def test_squares_go_on_a_quarter_of_a_square_beside_where_a_lens_bends_them(self, turn: int) -> None:
@@ -85,7 +84,7 @@ class TestWholeBoards:
         low = np.concatenate([low, low[-5:]])  # the same size
         whole, grid = seen_from(turn, low, grid - torch.tensor([0.0, 5.0]))
         part = (grid[1:], grid[:-1], grid[:, 1:], grid[:, :-1])[turn]
-        assert goes_on(whole, part.reshape(-1, 2), part.shape[1], part.shape[0])
+        assert goes_on(whole, part)
 
     @pytest.mark.parametrize("turn", range(4))
     def test_an_outer_line_needs_a_third_of_the_contrast_outside(self, turn: int) -> None:
@@ -93,7 +92,7 @@ class TestWholeBoards:
             signs = alternating(7, 6)
             signs[0] *= share
             image, grid = seen_from(turn, *picture(signs, ground=0.0))
-            found = false_sides(image, grid.reshape(-1, 2), grid.shape[1], grid.shape[0])
+            found = false_sides(image, grid)
             assert found.tolist() == [false and k == turn for k in range(4)]
 
     @pytest.mark.parametrize("turned", [False, True])
@@ -106,7 +105,7 @@ class TestWholeBoards:
             lines = grid[1::2]
             if turned:
                 image, lines = np.ascontiguousarray(image.T), lines.transpose(0, 1).flip(-1)
-            assert skips(image, lines.reshape(-1, 2), lines.shape[1], lines.shape[0]) is skipped
+            assert skips(image, lines) is skipped
 
     @pytest.mark.parametrize(("wide", "meet", "even"), [(33, 0, True), (35, 0, False), (53, 1, True), (55, 1, False)])
     def test_sides_may_grow_by_seventy_percent(self, wide: int, meet: int, even: bool) -> None:
@@ -215,7 +214,7 @@ class TestParts:
     @pytest.mark.parametrize(("columns", "rows", "count"), [(4, 3, 1), (5, 3, 2), (4, 4, 4), (5, 5, 2), (6, 4, 2)])
     def test_turns_that_look_the_same(self, columns: int, rows: int, count: int) -> None:
         board = Board(columns=columns, rows=rows, square=0.1)
-        assert _symmetries(board) == count
+        assert len(board.quarter_turns) == count
         image, grid = picture(alternating(rows + 1, columns + 1))
         assert len(_placements(image, grid, (True,) * 4, board)) == count
 
@@ -447,7 +446,7 @@ def test_a_board_of_which_a_corner_is_hidden_is_sought_further() -> None:
     board = Board(columns=9, rows=6, square=0.025)
     pixels = 20.0 * board.points[:, :2] / board.square + 40.0
     image = np.zeros((200, 300), np.uint8)
-    assert search._is_all(image, search.BoardPart(pixels), board)
+    assert search._is_all(image, search.FoundBoard(pixels), board)
     pixels[0] = torch.nan
-    assert not search._is_all(image, search.BoardPart(pixels), board)
-    assert search._is_all(image, search.BoardPart(pixels - 41.0), board)
+    assert not search._is_all(image, search.FoundBoard(pixels), board)
+    assert search._is_all(image, search.FoundBoard(pixels - 41.0), board)

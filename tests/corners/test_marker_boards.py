@@ -14,6 +14,7 @@ from kcal.corners.images import read_gray
 from kcal.corners.marker_boards import _opencv_board, find_aprilgrid, find_charuco, free_side
 from kcal.corners.markers import marker_cells, opencv_dictionary
 from kcal.corners.print_board import board_sheet, pattern_shapes
+from kcal.corners.search import NotFoundError
 from kcal.lens import rotation_from_vector
 from scripts.bench.hard_boards import covered, cut, moving, noisy, pictures, plain, small
 from scripts.bench.hard_scenes import Marked
@@ -145,9 +146,9 @@ def test_nothing_there():
 def test_windows_end_before_the_cells_inside_a_tag(paper):
     image, _ = paper.shoot(CAMERA, *pose(BOARD, [0.0, 0.0, 0.0], 0.33))
     tag = 430 * 0.035 / 0.33
-    side = find_aprilgrid(image, BOARD).side
-    assert 0.5 * float(side.nanmedian()) < 0.2 * 2**0.5 * tag  # two of ten cells, along the diagonal
-    assert 0.5 * float(side.nanmedian()) > 0.15 * 2**0.5 * tag
+    side = find_aprilgrid(image, BOARD)[1].median()
+    assert 0.5 * float(side) < 0.2 * 2**0.5 * tag  # two of ten cells, along the diagonal
+    assert 0.5 * float(side) > 0.15 * 2**0.5 * tag
 
 
 def test_wrong_target_says_what_was_seen(paper, tmp_path):
@@ -401,7 +402,7 @@ def test_images_that_do_not_tell_follow_the_others(tmp_path):
     image, truth = drawn(board, True)
     part = image.copy()
     part[:, image.shape[1] * 6 // 10 :] = 255
-    assert find_charuco(part, board).legacy is None
+    assert find_charuco(part, board)[1] is None
     cv2.imwrite(str(tmp_path / "a.png"), part)
     cv2.imwrite(str(tmp_path / "b.png"), image)
     seen = detect([tmp_path / "a.png", tmp_path / "b.png"], board)
@@ -426,18 +427,15 @@ def test_markers_of_both_numberings_in_one_image():
     board = Board.parse("charuco:9x9", "25mm")
     today, before = (drawn(board, legacy)[0] for legacy in (False, True))
     middle = len(today) // 2
-    found = find_charuco(
-        np.concatenate([today[:middle], np.full((60, today.shape[1]), 255, np.uint8), before[middle:]]), board
-    )
-    assert found.pixels is None
-    assert "two boards; hide one" in found.reason
+    both = np.concatenate([today[:middle], np.full((60, today.shape[1]), 255, np.uint8), before[middle:]])
+    with pytest.raises(NotFoundError, match="two boards; hide one"):
+        find_charuco(both, board)
 
 
 def test_another_size():
     image, _ = drawn(Board.parse("charuco:8x5", "25mm"), False)
-    found = find_charuco(image, Board.parse("charuco:6x9", "25mm"))
-    assert found.pixels is None
-    assert "markers do not lie as on this board" in found.reason
+    with pytest.raises(NotFoundError, match="markers do not lie as on this board"):
+        find_charuco(image, Board.parse("charuco:6x9", "25mm"))
 
 
 @pytest.mark.parametrize(

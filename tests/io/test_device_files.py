@@ -98,6 +98,11 @@ class TestDepthai:
         code, words = run("import", tmp_path / "oak.json", "-o", tmp_path / "rig.json")
         assert (code, "CAM_A, CAM_B, CAM_C" in words) == (0, True)
 
+    def test_sockets_that_lead_in_a_circle_have_no_poses(self, tmp_path: Path) -> None:
+        data = eeprom((0, socket(-1, (0, 0, 0))), (1, socket(2, (1, 0, 0))), (2, socket(1, (1, 0, 0))))
+        found = import_cameras(written(tmp_path, "oak.json", data))
+        assert (len(found.cameras), found.poses) == (3, ())
+
     def test_fisheyes_and_cameras_that_are_none(self, tmp_path: Path) -> None:
         four = [0.05, -0.01, 0.003, -0.001]
         wide = socket(-1, (0, 0, 0), kind=1, lens=[*four, *[0.0] * 10])

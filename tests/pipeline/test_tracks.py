@@ -16,7 +16,7 @@ from kcal import InputError, Localizer
 from kcal.locate.tables import NUMBERS, TEXTS
 from kcal.pipeline.estimates import track_states
 from kcal.pipeline.imm_filter import Motion, Timing, born
-from kcal.pipeline.measurements import anchored, known_sightings, sightings
+from kcal.pipeline.measurements import anchored, known_views, sightings
 from kcal.pipeline.stream import track_columns
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 from kcal.rig import RigCovariance
@@ -39,7 +39,9 @@ def test_one_sighting_is_what_the_localizer_says() -> None:
     pairs = pairs_of(left, right + tensor([0.0, 0.4]), 7.0)
     expected = localize(pairs.left, pairs.right, pairs.covariance)
     stations = localize.weighing_all()
-    seen = sightings(known_sightings(stations), pairs.pixels, pairs.seen, pairs.covariance, pairs.time)
+    seen = sightings(
+        known_views(stations.posed, stations.common), pairs.pixels, pairs.seen, pairs.covariance, pairs.time
+    )
     turned = torch.linalg.qr(torch.eye(3).double() + 0.2 * mix[:3, :3])[0]
     frame = ((turned * torch.sign(turned.diagonal())).T @ localize.enu_from_rig.T).expand(4, 3, 3)
     timing = Timing(torch.zeros(2, 4).double(), torch.zeros(0, 3, 4).double(), torch.zeros(0, 4).double())
