@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -50,22 +51,24 @@ def observations(side: int, count: int, noise: float = 0.1) -> Observations:
     return Observations(board=BOARD, image_size=SIZE, views=tuple(views))
 
 
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the observations and both cameras; tests work in copies."""
+    made = tmp_path_factory.mktemp("calibrated")
+    for side, word in enumerate(("left", "right")):
+        observations(side, 6).save(made / f"{word}.obs.json")
+        words = ["calibrate", str(made / f"{word}.obs.json"), "-o", str(made / f"{word}.camera.json")]
+        outcome = CliRunner().invoke(app, words)
+        assert outcome.exit_code == 0, outcome.output
+    return made
+
+
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    observations(0, 6).save(tmp_path / "left.obs.json")
-    observations(1, 6).save(tmp_path / "right.obs.json")
+def folder(calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    shutil.copytree(calibrated, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     return tmp_path
-
-
-@pytest.fixture
-def cameras(folder: Path) -> Path:
-    """The folder with both cameras calibrated in it."""
-    for word in ("left", "right"):
-        outcome = CliRunner().invoke(app, ["calibrate", f"{word}.obs.json", "-o", f"{word}.camera.json"])
-        assert outcome.exit_code == 0, outcome.output
-    return folder
 
 
 PAIRS = "--pairs left.obs.json right.obs.json"
@@ -73,13 +76,13 @@ PAIRS = "--pairs left.obs.json right.obs.json"
 
 class TestCalibrate:
     def test_writes_a_camera_file(self, folder: Path, command: Command) -> None:
-        arguments = "left.obs.json -o left.camera.json --model opencv4 --name mast --picture left.png"
+        arguments = "left.obs.json -o new.camera.json --model opencv4 --name mast --picture left.png"
         printed = command("calibrate", arguments)
         assert "6 views, 252 corners, 640x480 px, model opencv4" in printed.out
-        assert "wrote left.camera.json" in printed.out
+        assert "wrote new.camera.json" in printed.out
         assert "wrote left.png" in printed.out
         assert printed.err == ""
-        file = CameraFile.load(folder / "left.camera.json")
+        file = CameraFile.load(folder / "new.camera.json")
         assert file.name == "mast"
         assert file.calibration is not None
         assert file.calibration.views == 6
@@ -218,12 +221,12 @@ class TestCalibrate:
 
 class TestRig:
     @pytest.mark.slow
-    def test_writes_a_rig_file(self, cameras: Path, command: Command) -> None:
+    def test_writes_a_rig_file(self, folder: Path, command: Command) -> None:
         printed = command("rig left.camera.json right.camera.json", PAIRS, "-o rig.json")
         assert "6 of 6 pairs used, 0 views without partner" in printed.out
         assert "wrote rig.json" in printed.out
         assert printed.err == ""
-        file = RigFile.load(cameras / "rig.json")
+        file = RigFile.load(folder / "rig.json")
         assert file.calibration is not None
         assert file.calibration.pairs == 6
         assert float(file.rig().baseline) == pytest.approx(float(RIG.baseline), rel=0.02)
@@ -234,19 +237,19 @@ class TestRig:
         assert side == pytest.approx(50.0, rel=2e-3)
 
     @pytest.mark.slow
-    def test_boards_in_the_joint_adjustment(self, cameras: Path, command: Command) -> None:
+    def test_boards_in_the_joint_adjustment(self, folder: Path, command: Command) -> None:
         """With a measured baseline beside them, which agrees with what the boards say to a few of its sigmas."""
-        content = json.loads((cameras / "right.obs.json").read_text())
+        content = json.loads((folder / "right.obs.json").read_text())
         content["views"][1]["pixels"].reverse()
-        (cameras / "right.obs.json").write_text(json.dumps(content))
+        (folder / "right.obs.json").write_text(json.dumps(content))
         more = f"--baseline {float(RIG.baseline)}±0.0002 -o joint.json --picture rig.png"
         printed = command("rig left.camera.json right.camera.json", PAIRS, more)
         assert printed.out.startswith("source")
         assert "σ of range" in printed.out
         assert "taken as exact" not in printed.out
         assert "turned by 180°: left01.png right01.png (right; the board" in printed.out
-        assert (cameras / "rig.png").read_bytes().startswith(b"\x89PNG")
-        file = RigFile.load(cameras / "joint.json")
+        assert (folder / "rig.png").read_bytes().startswith(b"\x89PNG")
+        file = RigFile.load(folder / "joint.json")
         assert file.calibration is not None
         assert file.calibration.pairs == 6
         assert float(file.rig().baseline) == pytest.approx(float(RIG.baseline), abs=0.001)
@@ -254,22 +257,21 @@ class TestRig:
         assert file.known() is not None
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("keep_all", [False, True])
-    @pytest.mark.parametrize("shift", [1.5, 40.0])
+    @pytest.mark.parametrize(("shift", "keep_all"), [(1.5, False), (40.0, True)])
     def test_pictures_change_nothing_and_all_can_be_kept(
-        self, cameras: Path, command: Command, shift: float, keep_all: bool
+        self, folder: Path, command: Command, shift: float, keep_all: bool
     ) -> None:
         """A board that moved between the two exposures."""
-        content = json.loads((cameras / "right.obs.json").read_text())
+        content = json.loads((folder / "right.obs.json").read_text())
         for pixel in content["views"][4]["pixels"]:
             pixel[1] += shift
-        (cameras / "right.obs.json").write_text(json.dumps(content))
+        (folder / "right.obs.json").write_text(json.dumps(content))
         arguments = f"rig left.camera.json right.camera.json {PAIRS}{' --keep-all' if keep_all else ''}"
         printed = command(arguments, "-o plain.json")
         drawn = command(arguments, "-o drawn.json --picture rig.png")
         assert drawn.err == printed.err
         assert drawn.out.replace("drawn", "plain").replace("wrote rig.png\n", "") == printed.out
-        plain, picture = (RigFile.load(cameras / name) for name in ("plain.json", "drawn.json"))
+        plain, picture = (RigFile.load(folder / name) for name in ("plain.json", "drawn.json"))
         assert plain.poses == picture.poses
         assert plain.calibration is not None
         assert plain.calibration.pairs == (6 if keep_all else 5)
@@ -277,7 +279,7 @@ class TestRig:
         assert ("left out: board left04.png right04.png: " in printed.err) != keep_all
 
     @pytest.mark.slow
-    def test_a_failure_leaves_no_file(self, cameras: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    def test_a_failure_leaves_no_file(self, folder: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
         def fails(*_: object) -> None:
             raise DegenerateError("no side of a square could be triangulated")
 
@@ -286,7 +288,7 @@ class TestRig:
         assert "no side of a square" in command.refuses(arguments)
 
     @pytest.mark.slow
-    def test_swapped_throughout(self, cameras: Path, command: Command) -> None:
+    def test_swapped_throughout(self, folder: Path, command: Command) -> None:
         """Cameras and observations agree; the right camera is on the left."""
         pairs = "--pairs right.obs.json left.obs.json"
         both = ["right.camera.json", "left.camera.json"]
@@ -294,13 +296,13 @@ class TestRig:
         assert "this camera is named 'right', and left.camera.json 'left'" in said
         # Names that do not tell: the solution does.
         for name in both:
-            content = json.loads((cameras / name).read_text())
-            (cameras / name).write_text(json.dumps({**content, "name": "some"}))
+            content = json.loads((folder / name).read_text())
+            (folder / name).write_text(json.dumps({**content, "name": "some"}))
         said = command("rig", *both, pairs, "-o rig.json").err
         assert "to the left of the left camera: left and right are swapped" in said
 
-    def test_pairs_from_a_csv(self, cameras: Path, command: Command) -> None:
-        (cameras / "pairs.csv").write_text(
+    def test_pairs_from_a_csv(self, folder: Path, command: Command) -> None:
+        (folder / "pairs.csv").write_text(
             "left,right\n" + "".join(f"left{i:02}.png,right{i:02}.png\n" for i in (1, 3, 4))
         )
         arguments = f"left.camera.json right.camera.json {PAIRS} -o rig.json --match pairs.csv"
@@ -312,22 +314,22 @@ class TestRig:
         printed = command("rig", arguments, "--intrinsics free --board-warp").out
         assert "3 of 3 pairs used, 6 views without partner" in printed
         assert "mm along its rows" in printed
-        (cameras / "pairs.csv").write_text("left,right\nleft01.png,right77.png\n")
-        (cameras / "rig.json").unlink()
+        (folder / "pairs.csv").write_text("left,right\nleft01.png,right77.png\n")
+        (folder / "rig.json").unlink()
         text = command.refuses("rig", arguments)
         assert "pairs.csv: line 2: no view of the right camera is named 'right77.png'" in text
 
     @pytest.mark.slow
-    def test_turned_and_wrong_pairs_are_listed(self, cameras: Path, command: Command) -> None:
-        content = json.loads((cameras / "right.obs.json").read_text())
+    def test_turned_and_wrong_pairs_are_listed(self, folder: Path, command: Command) -> None:
+        content = json.loads((folder / "right.obs.json").read_text())
         content["views"][1]["pixels"].reverse()
         for pixel in content["views"][4]["pixels"]:
             pixel[1] += 40.0
-        (cameras / "right.obs.json").write_text(json.dumps(content))
+        (folder / "right.obs.json").write_text(json.dumps(content))
         printed = command("rig left.camera.json right.camera.json", PAIRS, "-o rig.json")
         assert "turned by 180°: left01.png right01.png (right; the board" in printed.out
         assert "left out: board left04.png right04.png: " in printed.err
-        file = RigFile.load(cameras / "rig.json")
+        file = RigFile.load(folder / "rig.json")
         record = file.calibration
         assert record is not None
         assert record.flipped == ("left01.png right01.png",)
@@ -355,14 +357,14 @@ class TestRig:
             ("left.camera.json right.camera.json --pairs left.obs.json left.obs.json", "camera twice"),
         ],
     )
-    def test_refusals(self, cameras: Path, command: Command, arguments: str, message: str) -> None:
+    def test_refusals(self, folder: Path, command: Command, arguments: str, message: str) -> None:
         assert message in command.refuses("rig", arguments, "-o rig.json")
 
-    def test_views_that_cannot_be_paired(self, cameras: Path, command: Command) -> None:
-        content = json.loads((cameras / "right.obs.json").read_text())
+    def test_views_that_cannot_be_paired(self, folder: Path, command: Command) -> None:
+        content = json.loads((folder / "right.obs.json").read_text())
         for i, view in enumerate(content["views"]):
             view["name"] = "abcdef"[i]
-        (cameras / "right.obs.json").write_text(json.dumps(content))
+        (folder / "right.obs.json").write_text(json.dumps(content))
         text = command.refuses("rig left.camera.json right.camera.json", PAIRS, "-o r.json")
         assert "give a CSV of pairs" in text
 

@@ -132,10 +132,9 @@ class TestNumbers:
         assert result.rms == pytest.approx(expected, rel=4 / (2 * count) ** 0.5)
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("seed", [0, 1])
-    def test_nested_models_never_end_higher(self, seed: int) -> None:
+    def test_nested_models_never_end_higher(self) -> None:
         truth = camera("opencv14")
-        pixels = pixels_of(truth, motions(truth, 8, seed + 20), noise=0.2, seed=seed)
+        pixels = pixels_of(truth, motions(truth, 8, 20), noise=0.2)
         rms = [solve(pixels, model).rms for model in ("opencv5", "opencv8", "opencv12", "opencv14")]
         # The last bits of a sum of squares.
         assert all(rich <= poor * (1 + 1e-12) for poor, rich in itertools.pairwise(rms)), rms
@@ -223,7 +222,7 @@ class TestSigmaTells:
             assert abs(float(values.mean()) - true) < 4.5 * (variance / 60) ** 0.5, name
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("seed", [1, 2, 3, 4])
+    @pytest.mark.parametrize("seed", [1, 2])
     def test_more_coefficients_than_the_lens_has(self, seed: int) -> None:
         """Trap 2: 8 and 14 coefficients on a lens of five fit better and know less, and σ or a warning says so.
 
@@ -279,8 +278,7 @@ class TestDegenerate:
         with pytest.raises(DegenerateError, match=rf"^{views} views? of the board: at least 3 at different tilts"):
             solve(pixels_of(truth, motions(truth, views, 1)))
 
-    @pytest.mark.parametrize("noise", [0.0, 0.1, 0.5])
-    @pytest.mark.parametrize("model", ["pinhole", "opencv5"])
+    @pytest.mark.parametrize(("model", "noise"), [("pinhole", 0.5), ("opencv5", 0.0)])
     def test_all_parallel_to_the_image(self, model: str, noise: float) -> None:
         """Trap 9: focal length and distance cannot be told apart, however small the residuals are."""
         truth = camera(model)
