@@ -8,6 +8,7 @@ import json
 import math
 import re
 import shlex
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -144,10 +145,13 @@ class TestRealImages:
 
     @pytest.mark.slow
     def test_demo_on_a_folder_of_pairs(self, run: Run, kcal_data: Path) -> None:
-        code, text, error = run("demo", "--images", kcal_data / "opencv_stereo", "-o", "out")
+        Path("pairs").mkdir()
+        for image in (kcal_data / "opencv_stereo").glob("*0[1-6].jpg"):
+            shutil.copy(image, "pairs")
+        code, text, error = run("demo", "--images", "pairs", "-o", "out")
         assert code == 0
         assert "no --site was given" in error
-        assert "13 of 13 pairs" in text
+        assert "6 of 6 pairs" in text
         for name in ("map.png", "points.geojson", "positions.csv", "left.png", "right.png", "rig.json", "points.csv"):
             assert Path("out", name).stat().st_size > 100
         page = Path("out", "summary.html").read_text()
@@ -160,7 +164,7 @@ class TestDemo:
     @pytest.mark.slow
     def test_simulated_site(self, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         # A third of the images, so that the test takes seconds.
-        small = functools.partial(kcal.sim.scene.DemoScene, near_views=7)
+        small = functools.partial(kcal.sim.scene.DemoScene, near_views=5)
         monkeypatch.setattr(kcal.sim.scene, "DemoScene", small)
         code, shown, _ = run("demo", "-o", "out", "--seed", "3")
         assert code == 0

@@ -105,6 +105,7 @@ def test_other_folders_are_refused(folder: Path, tmp_path: Path) -> None:
         practice_score(tmp_path / "work")
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_continued(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     count = 0
 
@@ -213,7 +214,7 @@ def test_options_that_exclude_each_other(tmp_path: Path) -> None:
 def test_the_walk_of_a_stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All commands of README.txt; marks are made from the truth with 0.3 px of noise, in the session of `kcal mark`."""
     folder = tmp_path / "site"
-    practice_site(folder, 1, views=12, frames=40, scale=0.5)
+    practice_site(folder, 1, views=8, frames=24, scale=0.5)
     monkeypatch.chdir(folder)
     readme = Path("README.txt").read_text()
     for step in STEPS:

@@ -45,11 +45,6 @@ def texts(figure: Figure) -> list[str]:
     return found + [text.get_text() for text in figure.texts]
 
 
-def markers(figure: Figure, marker: str, axes: int = 0) -> np.ndarray:
-    lines = [line for line in figure.axes[axes].lines if line.get_marker() == marker and len(line.get_xdata())]
-    return np.concatenate([np.stack([line.get_xdata(), line.get_ydata()], -1) for line in lines])
-
-
 def test_names_arcs_and_the_limits_of_the_interval_are_written() -> None:
     found = texts(positions_figure(*scene()))
     for name in ("gate", "mast", "ship", "cloud", "N", "250 m", "1 km", "5 km"):
@@ -58,22 +53,6 @@ def test_names_arcs_and_the_limits_of_the_interval_are_written() -> None:
     assert any("calibration" in text and "not included" in text for text in found)
     assert any(text.endswith("lost: a mark lies outside its image") for text in found)
     assert any(text.startswith("3 of 5 points located") for text in found)
-
-
-def test_points_are_drawn_along_their_azimuths_north_up_and_in_order_of_range() -> None:
-    located, enu = scene()
-    figure = positions_figure(located, enu)
-    true = markers(figure, "x")
-    assert len(true) == 4
-    azimuths = np.degrees(np.arctan2(true[:, 0], true[:, 1])) % 360
-    expected = np.degrees(np.arctan2(enu[:4, 0].numpy(), enu[:4, 1].numpy())) % 360
-    assert np.allclose(azimuths, expected, atol=1e-9)
-    radii = np.hypot(true[:, 0], true[:, 1])
-    assert (np.diff(radii) > 0.1).all()
-    assert radii.max() <= 1.0
-    # The second panel has true ranges relative to the estimates, from the nearest point down.
-    estimates = np.array([position.range_m for position in located.positions[:3]])
-    assert np.allclose(markers(figure, "x", 1)[:3, 0], TRUTH[:3].norm(dim=-1).numpy() / estimates - 1.0, atol=1e-12)
 
 
 def test_arrows_lead_from_truth_to_estimate_only_where_they_differ() -> None:

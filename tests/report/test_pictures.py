@@ -11,7 +11,6 @@ import pytest
 import torch
 from calibrate_scenes import BOARD, camera, motions
 from drawn_scenes import FIGURES, boxes, calibrated, landmarks_rig, sites
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver, QuiverKey
@@ -30,7 +29,6 @@ from kcal.report.calibration import (
     calibration_figure,
     coverage_figure,
     difference_figure,
-    difference_text,
     draw_coverage,
     gallery_figure,
 )
@@ -63,12 +61,6 @@ def widths(figure: Figure) -> list[float]:
     return [text.get_window_extent(canvas.get_renderer()).x1 / wide for text in figure.texts]
 
 
-def filled(figure: Figure) -> float:
-    """Share of the figure's height from the lowest axis to the highest."""
-    boxes = [axes.get_position() for axes in figure.findobj(Axes)]
-    return max(box.y1 for box in boxes) - min(box.y0 for box in boxes)
-
-
 @pytest.mark.parametrize("size", [(640, 480), (1920, 400), (480, 1600)])
 def test_a_misfit_has_its_whole_title_and_fills_its_page(size: tuple[int, int]) -> None:
     pixels = Camera.build(focal=(900, 900), center=(300, 200), size=size).grid(33, 25)
@@ -89,22 +81,6 @@ def test_places_up_to_the_edges_are_of_an_image_of_that_size() -> None:
     figure = difference_figure(Misfit(model="opencv4", pixels=pixels, shift=torch.full_like(pixels, 0.3)), "", [])
     assert figure.axes[0].get_xlim() == (-0.5, 639.5)
     assert figure.axes[0].get_ylim() == (479.5, -0.5)
-
-
-def test_a_difference_fills_its_page() -> None:
-    left = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
-    right = Camera.build(focal=(810, 800), center=(321, 240), size=(640, 480))
-    found = camera_difference(left, right)
-    figure = difference_figure(found, "june and december", difference_text(found))
-    # Below 0.5 where the image did not have the shape of its axes.
-    assert filled(figure) > 0.65
-    assert max(widths(figure)) < 1.0
-
-
-def test_the_picture_of_a_camera_names_it() -> None:
-    result = calibrate_camera(observed(), CalibrationOptions(model="opencv4"))
-    (title,) = [text.get_text() for text in calibration_figure(result, "left").texts]
-    assert title.startswith("left: 8 views")
 
 
 def test_a_view_that_was_left_out_has_no_arrows() -> None:
@@ -149,24 +125,6 @@ def bent_board(scale: float) -> MeasuredBoard:
     half = 1e-5 * torch.eye(28, dtype=torch.float64)
     board = Board(columns=6, rows=9, square=0.02)
     return MeasuredBoard(name="plate", board=board, amplitudes=amplitudes, half=half, log_evidence=0.0)
-
-
-def test_heights_and_arrows() -> None:
-    """The second mode is a saddle: corners of opposite heights; stretch moves the corners left and right."""
-    figure = board_figure(bent_board(2e-4))
-    axes = figure.axes[0]
-    assert "plate: 6x9 inner corners" in figure.texts[0].get_text()
-    assert "bending 0.200 ± 0.0" in figure.texts[1].get_text()
-    levels = axes.collections[0].norm
-    assert 0.2 <= float(levels.vmax) < 0.3
-    assert float(levels.vmin) == -float(levels.vmax)
-    (arrows,) = [part for part in axes.collections if isinstance(part, Quiver)]
-    assert arrows.N == 54
-    across, down = np.array(arrows.U), np.array(arrows.V)
-    x = 1e3 * bent_board(0.0).board.points[:, 0].numpy()
-    np.testing.assert_array_equal(np.sign(np.round(across, 9)), np.sign(x - x.mean()))
-    # Nothing longer than the distance of the corners, 20 mm.
-    assert 8.0 < float(np.hypot(across, down).max()) <= 20.0
 
 
 def test_text_of_a_flat_board() -> None:
@@ -251,12 +209,6 @@ def test_pictures_for_a_phone_are_narrow_and_whole(kind: str) -> None:
 
 
 # Arrows of pictures: of a plan's north, and of residuals, as long as there is room; levels of very small errors.
-
-
-def test_north_is_up() -> None:
-    plan = rig_figure(landmarks_rig()).axes[0]
-    (arrow,) = [text for text in plan.texts if getattr(text, "xycoords", "") == "axes fraction"]
-    assert (arrow.xy, arrow.xyann) == ((0.04, 1.0), (0.04, 0.89))
 
 
 def test_a_typical_residual_is_a_sixtieth_of_the_image() -> None:

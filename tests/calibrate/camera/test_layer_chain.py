@@ -38,10 +38,9 @@ def located(layer: CalibrationLayer, corners: tuple[Tensor, Tensor], start: list
     return torch.cat([where.enu[0], where.inverse_range])
 
 
-@pytest.mark.parametrize("model", ["opencv4", None])
-def test_a_position_is_differentiable_by_the_corners_of_calibration_images(model: str | None) -> None:
-    options = CalibrationOptions() if model is None else CalibrationOptions(model=model)
-    layer, corners = CalibrationLayer(SIZE, options), corners_of_both()
+@pytest.mark.slow
+def test_a_position_is_differentiable_by_the_corners_of_calibration_images() -> None:
+    layer, corners = CalibrationLayer(SIZE, CalibrationOptions()), corners_of_both()
     start: list[CalibratedViews | None] = [None, None]
     located(layer, corners, start)
     amount = torch.zeros(2, dtype=torch.float64, requires_grad=True)
@@ -73,10 +72,9 @@ def test_a_differentiable_camera_is_a_camera() -> None:
     assert torch.equal(attached.resized((320, 240)).params, plain.resized((320, 240)).params)
 
 
-@pytest.mark.parametrize("model", ["opencv4", None])
-def test_what_comes_of_another_device_returns_to_it(model: str | None) -> None:
-    options = CalibrationOptions() if model is None else CalibrationOptions(model=model)
-    layer, corners = CalibrationLayer(SIZE, options), corners_of_both()[0].requires_grad_(True)
+@pytest.mark.slow
+def test_what_comes_of_another_device_returns_to_it() -> None:
+    layer, corners = CalibrationLayer(SIZE, CalibrationOptions()), corners_of_both()[0].requires_grad_(True)
     points = torch.tensor([[0.1, 0.05, 1.0]], dtype=torch.float64)
     here = layer(corners, BOARD.points)
     layer(corners, BOARD.points, start=here).project(points)[0].sum().backward()
