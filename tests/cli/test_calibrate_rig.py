@@ -97,6 +97,7 @@ class TestCalibrate:
         assert row[1] == number_text(float(found.focal[0]), file.standard_deviations["fx"])
         assert (folder / "left.png").read_bytes().startswith(b"\x89PNG")
 
+    @pytest.mark.slow
     def test_outliers_are_left_out_and_listed(self, folder: Path, command: Command) -> None:
         content = json.loads((folder / "left.obs.json").read_text())
         u, v = content["views"][2]["pixels"][5]
@@ -301,6 +302,7 @@ class TestRig:
         said = command("rig", *both, pairs, "-o rig.json").err
         assert "to the left of the left camera: left and right are swapped" in said
 
+    @pytest.mark.slow
     def test_pairs_from_a_csv(self, folder: Path, command: Command) -> None:
         (folder / "pairs.csv").write_text(
             "left,right\n" + "".join(f"left{i:02}.png,right{i:02}.png\n" for i in (1, 3, 4))

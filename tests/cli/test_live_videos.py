@@ -78,6 +78,7 @@ def test_positions_and_clock_are_right_within_their_sigmas(folder: Path) -> None
         assert abs(pace) < 3.5 * float(row["velocity_east_sigma_mps"])
 
 
+@pytest.mark.slow
 def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     live(folder, "--clock-offset", str(LATE))
     whole = (folder / "tracks.csv").read_bytes()
@@ -107,6 +108,7 @@ def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: p
     assert (folder / "tracks.csv").read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_three_videos_of_three_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The third camera stops in the middle and names stay; what SIGTERM interrupts is continued to the same table."""
     pair = small_rig()

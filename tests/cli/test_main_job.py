@@ -194,6 +194,7 @@ class TestDemo:
 
 
 class TestCompare:
+    @pytest.mark.slow
     def test_one_table_of_all_models(self, run: Run) -> None:
         observations(8, tilt=0.5).save("a.obs.json")
         command = "compare a.obs.json --model pinhole opencv4 --groups views --parts 2"
@@ -210,6 +211,7 @@ class TestCompare:
         assert held_out - table[lowest][0] == pytest.approx(more, abs=2e-4)
         assert sigma > 0
 
+    @pytest.mark.slow
     def test_table_and_picture(self, run: Run) -> None:
         observations(8, tilt=0.5).save("a.obs.json")
         command = "compare a.obs.json --model pinhole opencv4 --groups views --parts 2 -o m.csv --picture m.svg"
@@ -342,6 +344,7 @@ def test_one_of_several_cameras(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "a.camera.json").exists()
 
 
+@pytest.mark.slow
 def test_focal_lengths_are_those_on_the_axis(tmp_path: Path) -> None:
     """Printed by calibrate, show and diff alike, and told to programs; fx of the file is another number."""
     path, file = write(tmp_path / "a.obs.json", 8), tmp_path / "a.camera.json"

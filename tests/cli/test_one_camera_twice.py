@@ -55,6 +55,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("marks", ["marks.csv", "long-marks.csv"])
 def test_a_file_given_twice_is_one_camera_at_two_places(folder: Path, command: Command, marks: str) -> None:
     said = command("rig mast.camera.json mast.camera.json --marks", marks, SURVEYED)

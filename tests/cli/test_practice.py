@@ -75,6 +75,7 @@ def truth(made: Path) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_what_is_there_is_kept_and_what_is_missing_is_made(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = contents(folder)
     assert {"README.txt", "survey.csv", "site/left.png", "boards/right/02.png", "video/right.mp4"} < set(before)
@@ -148,6 +149,7 @@ def test_what_comes_next_is_said_step_by_step(folder: Path, capsys: pytest.Captu
     assert next_step(folder) == STEPS[4]
 
 
+@pytest.mark.slow
 def test_without_the_extra_for_videos_the_rest_is_made(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -105,6 +105,7 @@ def test_new_camera_file_is_a_pinhole(folder: Path, command: Command) -> None:
     assert content["coefficients"] == {}
 
 
+@pytest.mark.slow
 def test_done_images_are_not_made_again(folder: Path, command: Command) -> None:
     """They are after a change of the image, of the view, or where the output is gone or another program's."""
     for name in "ab":

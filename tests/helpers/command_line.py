@@ -36,7 +36,8 @@ class Command:
         return said
 
     def refuses(self, *words: object) -> str:
-        """The one line that a command says which must fail. Nothing may appear or change in the folder."""
+        """The one line that a command says which must fail. Nothing may appear or change in the working folder."""
+        assert not Path("pyproject.toml").exists(), "give the test a folder of its own: every file in it is compared"
         before = contents()
         said = self(*words, code=1)
         assert said.err.startswith("error: "), said.err

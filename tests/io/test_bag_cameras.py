@@ -223,7 +223,8 @@ def test_a_rectified_pair_without_tf(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_commands(tmp_path: Path, command: Command) -> None:
+def test_commands(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     save_rig(rig(2), tmp_path / "rig.json")
     bag = tmp_path / "calibration.mcap"
     said = command("export", tmp_path / "rig.json", "--format ros -o", bag)

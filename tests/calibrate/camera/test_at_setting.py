@@ -63,6 +63,7 @@ def test_a_setting_that_was_calibrated_is_that_camera() -> None:
     assert (found.weights, found.interpolation_px) == ((0.0, 0.0, 1.0, 0.0, 0.0), 0.0)
 
 
+@pytest.mark.slow
 def test_beside_a_setting_nothing_jumps() -> None:
     """The general way, through a fit, gives the calibration as well: mean, covariance and entrance pupil."""
     truth = camera("opencv4")
@@ -109,6 +110,7 @@ def test_errors_of_the_curve_contain_it_in_95_percent() -> None:
             assert float((error.abs() < 1.96 * sigma).double().mean()) == pytest.approx(0.95, abs=0.012)
 
 
+@pytest.mark.slow
 def test_errors_go_through_as_they_do_by_differences() -> None:
     """Each camera's error, and that of the motor, move the interpolated camera as its covariance says."""
     settings = SETTINGS[::2]

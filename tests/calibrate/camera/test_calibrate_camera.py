@@ -72,6 +72,7 @@ class TestNoiseFree:
         assert len(rays) > 400
         assert float((result.camera.project(rays)[0] - truth.project(rays)[0]).norm(dim=-1).max()) < 1e-2
 
+    @pytest.mark.slow
     def test_board_warp_comes_back(self) -> None:
         truth = camera()
         rotation, translation = motions(truth, 8, 1)
@@ -139,6 +140,7 @@ class TestNumbers:
         # The last bits of a sum of squares.
         assert all(rich <= poor * (1 + 1e-12) for poor, rich in itertools.pairwise(rms)), rms
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("model", ["pinhole", "opencv4", "opencv5"])
     def test_sigma_is_the_covariance_of_all_parameters(self, model: str) -> None:
         """diag((JᵀJ)⁻¹) ‖r‖² / (n - p) of one dense Jacobian over camera and poses, by automatic differentiation."""
@@ -163,6 +165,7 @@ class TestNumbers:
         torch.testing.assert_close(found, expected[: len(found)], rtol=1e-6, atol=0)
         assert list(result.sigma) == [name for name in result.camera.names if name != "skew"]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("model", ["opencv5", "opencv8"])
     def test_sigma_is_opencvs(self, model: str) -> None:
         cv2 = pytest.importorskip("cv2")
@@ -278,6 +281,7 @@ class TestDegenerate:
         with pytest.raises(DegenerateError, match=rf"^{views} views? of the board: at least 3 at different tilts"):
             solve(pixels_of(truth, motions(truth, views, 1)))
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("model", "noise"), [("pinhole", 0.5), ("opencv5", 0.0)])
     def test_all_parallel_to_the_image(self, model: str, noise: float) -> None:
         """Trap 9: focal length and distance cannot be told apart, however small the residuals are."""

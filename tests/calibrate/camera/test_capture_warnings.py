@@ -34,6 +34,7 @@ def fitted(views: int, hands: Hands | None) -> HybridFit:
     return fit_hybrid(board_points(BOARD), pixels, CAMERA.size, options=FitOptions(modes=MODES, square=True))
 
 
+@pytest.mark.slow
 def test_motion_is_told_in_pixels() -> None:
     many = sentences(motion_findings(fitted(12, HANDS)))
     assert len(many) == 1
@@ -41,6 +42,7 @@ def test_motion_is_told_in_pixels() -> None:
     assert motion_findings(fitted(12, None)) == []
 
 
+@pytest.mark.slow
 def test_few_views_that_moved() -> None:
     """Their error bars are wide, and may still be too small, which no other warning says."""
     few = sentences(motion_findings(fitted(5, HANDS)))
@@ -70,6 +72,7 @@ CHECKERBOARD = Board(columns=9, rows=6, square=0.025)
 
 
 class TestSpacing:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("factor", "board"), [(1.25, ASYMMETRIC), (0.7, CHECKERBOARD), (0.95, CHECKERBOARD), (1.3, CHECKERBOARD)]
     )
@@ -83,6 +86,7 @@ class TestSpacing:
         assert found.rms < 0.08
         assert found.camera.focal[0] == pytest.approx(900.0, abs=5.0 * (found.sigma["fx"] or 0.0))
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("options", [CalibrationOptions(model="opencv5"), CalibrationOptions(board="exact")])
     def test_a_lens_that_cannot_allow_for_it_is_refused(self, options: CalibrationOptions) -> None:
         with pytest.raises(InputError, match="columns of the board are 30 mm apart, and its rows 25 mm"):
@@ -95,6 +99,7 @@ class TestSpacing:
         assert not any("apart" in text for text in said)
         assert any("pixels are not square" in text for text in said) == (aspect != 1.0)
 
+    @pytest.mark.slow
     def test_upright_views_hardly_tell_the_board_from_the_pixels(self) -> None:
         (upright,) = (t for t in calibrate_camera(unequal(1.2, CHECKERBOARD, 0.1)).warnings if "apart" in t)
         (turned,) = (t for t in calibrate_camera(unequal(1.2, CHECKERBOARD)).warnings if "apart" in t)

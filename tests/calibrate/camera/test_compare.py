@@ -39,6 +39,7 @@ def test_a_model_that_holds_the_lens_finds_it() -> None:
     assert float(error.max()) <= found.largest * 1.5
 
 
+@pytest.mark.slow
 def test_the_misfit_is_that_over_the_image() -> None:
     """A richer model misses less; what is stated is what a comparison at other places of the image finds."""
     head = torch.tensor([520.0, 520.0, 325.0, 235.0, 0.0], dtype=torch.float64)
@@ -91,6 +92,7 @@ def capture(count: int = 12, bend: float = 0.0, spread: bool = False) -> Observa
     return Observations(board=BOARD, image_size=COMPARED_SIZE, views=tuple(views))
 
 
+@pytest.mark.slow
 def test_the_true_model_predicts_to_the_noise() -> None:
     result = compare_models(capture(), ["pinhole", "opencv5"], groups="views", parts=4)
     # Of each held-out view six numbers are fitted again, the poses.
@@ -103,6 +105,7 @@ def test_the_true_model_predicts_to_the_noise() -> None:
     assert result.corners.tolist() == [48] * 12
 
 
+@pytest.mark.slow
 def test_the_board_is_the_measured_one() -> None:
     """An oblique bend of 1.5 mm: with the ordered board, or a warp that cannot follow it, held-out views show it."""
     seen = capture(bend=1.5e-3)
@@ -112,6 +115,7 @@ def test_the_board_is_the_measured_one() -> None:
     assert result.rms["opencv5"] > 2 * wanted
 
 
+@pytest.mark.slow
 def test_equal_covariances_change_nothing() -> None:
     plain, weighted = (
         compare_models(capture(spread=spread), ["opencv5"], groups="views", parts=3) for spread in (False, True)
@@ -119,6 +123,7 @@ def test_equal_covariances_change_nothing() -> None:
     assert weighted.rms["opencv5"] == pytest.approx(plain.rms["opencv5"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_groups() -> None:
     told: list[str] = []
     result = compare_models(capture(), ["opencv4"], groups=list("aabbccddeeff"), parts=2, progress=told.append)
@@ -289,6 +294,7 @@ def test_calibration(tmp_path, text, square, distance, shift):
     assert len(possible_views(camera, board).words) > 50
 
 
+@pytest.mark.slow
 def test_old_charuco_boards_calibrate(tmp_path):
     """The old numbering, as OpenCV drew it; views that show a part only."""
     board = Board.parse("charuco:8x5", "25mm")
@@ -306,6 +312,7 @@ def test_old_charuco_boards_calibrate(tmp_path):
     assert camera_difference(load_camera(file), CAMERA).probability > 0.01
 
 
+@pytest.mark.slow
 def test_two_boards_are_detected_one_after_the_other(tmp_path):
     from scripts.shared.printed_board import expose, light_of
 

@@ -177,6 +177,7 @@ class TestRolls:
         exact = calibrate_camera(seen, CalibrationOptions(board="exact"))
         assert not any("upright" in text for text in exact.warnings)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["pi640", "ch1280"])
     def test_captures_by_others(self, kcal_data, name: str) -> None:
         """Rolls do not depend on a calibration's quality: those of a plain start are enough."""

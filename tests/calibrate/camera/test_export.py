@@ -69,6 +69,7 @@ def test_opencv_itself_reads_it(tmp_path: Path) -> None:
     assert np.abs(seen - pixels.numpy()).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["opencv", "kalibr", "mrcal"])
 def test_a_fitted_lens_keeps_its_stated_maximum(tmp_path: Path, name: str) -> None:
     subject = hybrid_camera("webcam")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import torch
 
 from kcal import Camera, Rig
@@ -25,6 +26,7 @@ def rig(left: Camera, right: Camera) -> Rig:
     return Rig.pair(left, right, torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
 
 
+@pytest.mark.slow
 def test_a_wide_pair_becomes_omni_in_kalibr(tmp_path: Path) -> None:
     assert export_cameras(NARROW, tmp_path / "one.yaml", format="kalibr").models == ("opencv4",)
     done = export_cameras(rig(NARROW, WIDE), tmp_path / "chain.yaml", format="kalibr")

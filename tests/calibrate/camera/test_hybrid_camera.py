@@ -91,6 +91,7 @@ def test_noise_free_corners() -> None:
     assert error_at_infinity(result.camera, truth()).rms < 1.0
 
 
+@pytest.mark.slow
 def test_outliers_are_left_out_and_listed() -> None:
     _, clean = capture()
     pixels = clean.clone()
@@ -107,6 +108,7 @@ def test_outliers_are_left_out_and_listed() -> None:
     assert error_at_infinity(result.camera, truth()).rms < 2.0 * summarize(calibrated()).worst
 
 
+@pytest.mark.slow
 def test_with_nothing_to_leave_out_the_camera_is_the_plain_one() -> None:
     """Not that of the robust fit, by which outliers are looked for and whose error bars mean nothing."""
     found = calibrate_camera(capture()[0], CalibrationOptions(reject=OutlierRejection()))
@@ -117,6 +119,7 @@ def test_with_nothing_to_leave_out_the_camera_is_the_plain_one() -> None:
     torch.testing.assert_close(found.covariance, calibrated().covariance, rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_corners_weigh_by_their_covariances() -> None:
     seen, clean = capture()
     blurred = clean.clone()

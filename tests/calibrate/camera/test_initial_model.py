@@ -98,6 +98,7 @@ def test_a_wrong_focal_length_of_a_wide_lens_is_not_believed(model: str, factor:
     assert float(told.camera.focal[0]) == pytest.approx(float(alone.camera.focal[0]), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_real_lens_of_150_degrees(kcal_data: Path) -> None:
     data = np.load(kcal_data / "wide_lens_corners.npz")
     views = []
@@ -115,6 +116,7 @@ def test_a_real_lens_of_150_degrees(kcal_data: Path) -> None:
     assert result.rms < 1.2
 
 
+@pytest.mark.slow
 def test_the_start_does_not_matter() -> None:
     seen = observe(pixels_of(TRUTH, motions(TRUTH, 15, 7), noise=0.2))
     ends = [
@@ -142,6 +144,7 @@ def test_exact_corners_are_hardly_moved() -> None:
     assert calibrate_camera(seen, CalibrationOptions(model="opencv14", weak_prior=0.3)).rms < 5e-4
 
 
+@pytest.mark.slow
 def test_a_prior_that_the_views_contradict_is_told_of() -> None:
     seen = observe(pixels_of(TRUTH, motions(TRUTH, 20, 5), noise=0.05))
     contradicted = [

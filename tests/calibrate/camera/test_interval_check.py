@@ -89,6 +89,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return int(stop.value.code or 0)
 
 
+@pytest.mark.slow
 def test_command(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -151,6 +152,7 @@ def test_own_views_find_a_wrong_model() -> None:
     assert fault_of_views(calibrate_camera(seen, options), options) is not None
 
 
+@pytest.mark.slow
 def test_default_lens() -> None:
     """Refits of the hybrid lens begin at the found one, and its intervals are true."""
     result = calibrate_camera(capture(4))

@@ -121,6 +121,7 @@ class TestDefaultLens:
     def base(self) -> CalibratedViews:
         return calibrate_views(CORNERS, BOARD.points, SIZE, backward="none")
 
+    @pytest.mark.slow
     def test_it_is_the_default(self) -> None:
         from calibrate_scenes import observe
 
@@ -151,6 +152,7 @@ class TestDefaultLens:
         zero = torch.zeros(2, dtype=torch.float64, requires_grad=True)
         assert torch.autograd.gradcheck(solve, (zero,), eps=1e-4, atol=2e-5, rtol=2e-5)
 
+    @pytest.mark.slow
     def test_recorded_steps_have_the_same_derivatives(self) -> None:
         base, gradients = self.base(), []
         for backward in ("implicit", "unroll"):
@@ -161,6 +163,7 @@ class TestDefaultLens:
         scale = float(gradients[0].abs().max())
         torch.testing.assert_close(gradients[1], gradients[0], rtol=0, atol=1e-6 * scale)
 
+    @pytest.mark.slow
     def test_a_start_keeps_the_amplitudes(self) -> None:
         base = self.base()
         again = calibrate_views(CORNERS + 1e-3, BOARD.points, SIZE, start=base, backward="none")
@@ -219,6 +222,7 @@ def test_unseen_corners_have_no_influence() -> None:
         assert bool((gradient[mask] != 0).all())
 
 
+@pytest.mark.slow
 def test_training_through_calibrations_finds_the_corners_bias() -> None:
     """A detector is off by an unknown matrix times a feature of each corner; cameras calibrated from it tell which.
 

@@ -26,6 +26,7 @@ CAMERA = Camera.build(
 SEEN = observe(printed_views(CAMERA, BOARD, BOARD.points, 5, 4, noise=0.1), board=BOARD, size=SIZE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["opencv5", "hybrid"])
 def test_it_gives_what_it_promises(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Against the covariance with the view's rows stacked onto those of the calibration."""

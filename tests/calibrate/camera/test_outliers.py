@@ -75,6 +75,7 @@ def test_clean_data_keep_all_corners_and_the_same_result() -> None:
     assert plain.warnings == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "views", "seed"), [("opencv5", 14, 4), ("opencv8", 25, 4)])
 def test_gross_outliers_are_found_and_move_nothing(model: str, views: int, seed: int) -> None:
     """By more than a σ. 14 views do not determine the eight coefficients (flat valley), so that one has more views."""
@@ -195,6 +196,7 @@ def test_many_such_views_are_refused_by_name() -> None:
         calibrate_camera(observe(shuffled(corners(), [2, 5, 8], seed=3)))
 
 
+@pytest.mark.slow
 def test_mirrored_views() -> None:
     pixels = corners()
     pixels[5, :, 0] = pixels[5, :, 0].max() + pixels[5, :, 0].min() - pixels[5, :, 0]
@@ -206,6 +208,7 @@ def test_mirrored_views() -> None:
     assert reasons(calibrate_camera(observe(flipped), CalibrationOptions(model="opencv5"))) == {}
 
 
+@pytest.mark.slow
 def test_a_start_that_shows_nothing_is_not_used() -> None:
     plain = calibrate_camera(observe(corners()))
     given = calibrate_camera(observe(corners()), CalibrationOptions(focal=5.0))
@@ -378,6 +381,7 @@ def test_poses_count_by_the_size_of_the_board() -> None:
         assert repeated_poses(torch.stack([view, view + 0.04 * along, view + 0.06 * along])) == {1: 0}
 
 
+@pytest.mark.slow
 def test_real_captures_repeat_nothing_and_their_copies_are_found(kcal_data: Path, tmp_path: Path) -> None:
     """Thirteen pictures of OpenCV's sample, three of them once more with other qualities of JPEG."""
     files = sorted((kcal_data / "opencv_stereo").glob("left*.jpg"))

@@ -72,6 +72,7 @@ def opencv(seen: Observations, model: str) -> tuple:
 # Of the right images; of the left ones OpenCV's minimum with 14 coefficients, which have many, is 0.7 % lower than the
 # lower one of the two next to kcal's starts.
 class TestCamera:
+    @pytest.mark.slow
     def test_five_coefficients_are_opencvs(self, seen: dict[str, Observations], solved: Solve) -> None:
         rms, matrix, lens, *_ = opencv(seen["right"], "opencv5")
         result = solved("right", "opencv5")
@@ -153,6 +154,7 @@ class TestRig:
         mean, _ = triangulated_sides(result.stereo(), BOARD.columns, BOARD.rows, result.pixels)
         assert mean == pytest.approx(BOARD.square, rel=1e-3)
 
+    @pytest.mark.slow
     def test_a_turned_board_changes_nothing(
         self, seen: dict[str, Observations], solved: Solve, rigs: dict[bool, RigResult]
     ) -> None:

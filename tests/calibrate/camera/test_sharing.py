@@ -207,6 +207,7 @@ def test_cameras_of_one_size_may_be_of_one_type() -> None:
     assert all(isinstance(one, DegenerateError) for one in calibrate_cameras(bad, one_type=True))
 
 
+@pytest.mark.slow
 def test_cameras_that_saw_other_boards_are_not_fitted_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is common to them: each stays as it is alone, and no time is spent."""
 
@@ -222,6 +223,7 @@ def test_cameras_that_saw_other_boards_are_not_fitted_together(monkeypatch: pyte
         sharing([found[0], found[0]], CalibrationOptions())
 
 
+@pytest.mark.slow
 def test_cameras_that_cannot_be_fitted_together_stay_as_they_are_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: object, **__: object) -> None:
         raise DegenerateError("nothing fits")
