@@ -164,6 +164,7 @@ def test_an_open_video_has_no_threads(video: Path) -> None:
     assert len(os.listdir("/proc/self/task")) == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="workers of torch are forked")
 def test_a_user_s_process_may_fork(video: Path) -> None:
     environment = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}

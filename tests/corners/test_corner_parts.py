@@ -47,7 +47,6 @@ from kcal.corners.grid import (
     without_false_sides,
 )
 from kcal.corners.marker_boards import in_place, inliers
-from kcal.corners.patches import highest_peak, is_textured, weighted_correlation
 from kcal.corners.recognize import like_sized, smallest
 from kcal.corners.search import (
     _predicted,
@@ -340,49 +339,6 @@ class TestSpread:
         assert weight[3].tolist() == pytest.approx([0.0, 0.25, 1.0, 1.0, 1.0, 0.75, 0.0])
         assert float(weight[1, 3]) == pytest.approx(2.5 - math.hypot(2, 0.25))
         assert window.of(torch.tensor([0])).radius.tolist() == [2.0]
-
-
-class TestPatches:
-    def test_correlation_at_every_shift(self) -> None:
-        template, wide, weight = draw(2, 3, 4), draw(2, 5, 7, seed=1), draw(2, 3, 4, seed=2).abs()
-        usable = torch.ones(2, 5, 7, dtype=torch.bool)
-        usable[0, 0, 0] = False
-        found = weighted_correlation(template, weight, wide, usable)
-        assert found.shape == (2, 3, 4)
-        for n in range(2):
-            for i in range(3):
-                for j in range(4):
-                    part, w = wide[n, i : i + 3, j : j + 4], weight[n] / weight[n].sum()
-                    if not bool(usable[n, i : i + 3, j : j + 4].all()):
-                        assert float(found[n, i, j]) == -1.0
-                        continue
-                    a, b = template[n] - (w * template[n]).sum(), part - (w * part).sum()
-                    by_hand = (w * a * b).sum() / ((w * a * a).sum() * (w * b * b).sum()).sqrt()
-                    assert float(found[n, i, j]) == pytest.approx(float(by_hand))
-        flat = weighted_correlation(torch.full((1, 3, 4), 5.0).double(), weight[:1], wide[:1], usable[:1])
-        assert flat.unique().tolist() == [-1.0]
-        one = weighted_correlation(template, weight, template * 3 + 7, torch.ones(2, 3, 4, dtype=torch.bool))
-        torch.testing.assert_close(one, torch.ones(2, 1, 1).double())
-
-    def test_texture_is_where_it_counts(self) -> None:
-        template = torch.zeros(2, 3, 3).double() + 100
-        template[0, 1, 1] += 1e-2
-        weight = torch.ones(2, 3, 3).double()
-        assert is_textured(template, weight).tolist() == [True, False]
-        weight[0, 1, 1] = 0.0
-        assert is_textured(template, weight).tolist() == [False, False]
-
-    def test_rivals_are_other_peaks_inside(self) -> None:
-        scores = torch.tensor([[[0.9, 0.2, 0.1, 0.3, 0.1, 0.5, 0.1, 0.8]]], dtype=torch.float64)
-        places = torch.stack([torch.arange(8.0), torch.zeros(8)], -1)[None].double()
-        peak = highest_peak(scores, places)
-        # At 3 it is too near, at 7 in the last column.
-        assert (int(peak.number), float(peak.score), float(peak.rival), bool(peak.edge)) == (0, 0.9, 0.5, True)
-        inner = highest_peak(scores.roll(1, 2), places)
-        assert (inner.place.tolist(), bool(inner.edge)) == ([[1.0, 0.0]], False)
-        assert float(highest_peak(scores[:, :, :3], places[:, :3]).rival) == -1.0
-        rows = highest_peak(torch.tensor([[[0.1, 0.2], [0.3, 0.7]]]).double(), torch.rand(2, 2, 2).double())
-        assert (int(rows.number), bool(rows.edge)) == (3, True)
 
 
 class TestFrames:

@@ -26,7 +26,7 @@ for library in ("starlette", "uvicorn"):
 pytestmark = needs_browser
 
 # Each start of the server takes seconds; `test_session.py` kills sessions at ten moments, without a browser.
-KILLS = int(os.environ.get("KCAL_KILLS", "3"))
+KILLS = int(os.environ.get("KCAL_KILLS", "2"))
 
 
 @pytest.fixture(scope="module")

@@ -70,32 +70,6 @@ def test_two_cameras_of_one_mast_are_paired_as_ever() -> None:
     assert len(pairs) > 25
 
 
-@pytest.mark.parametrize("count", [3, 5])
-def test_detections_of_one_thing_come_together(count: int) -> None:
-    rig, (places, _) = stations(count), scene(12, 0)
-    errors = drawn_errors(rig.root, 1, torch.Generator().manual_seed(3)).expand(12, -1)
-    pixels = marks(rig, places, errors)
-    g, seen, owners = torch.Generator().manual_seed(4), [], []
-    for c in range(count):
-        order = torch.randperm(12, generator=g)[: 12 - c]
-        owners.append(
-            {tuple(p.tolist()): int(i) for p, i in zip(boxes(pixels[order, c]).anchors(), order, strict=True)}
-        )
-        seen.append(boxes(pixels[order, c]))
-    found = group_objects(Localizer(rig), seen, AssociationOptions(box_sigma=1.0))
-    right = 0
-    for p, s, doubt in zip(found.pixels, found.seen.tolist(), found.ambiguous.tolist(), strict=True):
-        whose = {owners[c][tuple(p[c].tolist())] for c in range(count) if s[c]}
-        if sum(s) > 1 and not doubt:
-            assert len(whose) == 1
-            right += 1
-    assert right >= 9
-    # Nothing is lost: each detection is in a row.
-    for c in range(count):
-        rows = {tuple(p.tolist()) for p, s in zip(found.pixels[:, c], found.seen[:, c].tolist(), strict=True) if s}
-        assert rows == set(owners[c])
-
-
 def test_errors_of_tracks_are_as_large_as_stated() -> None:
     """Each target has its own true rig, so that shared errors are independent too; 3 degrees of freedom."""
     rig, count = stations(4), 60

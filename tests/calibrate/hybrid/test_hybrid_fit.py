@@ -214,19 +214,6 @@ def _form():
     return HybridForm(shape=0.4, radius=1.1)
 
 
-def test_prior_slopes() -> None:
-    _, families = linear_case()
-    h = typical_hyperprior().mean
-    first, second = families.log_variance_slopes(h)
-    for k in range(len(h)):
-        step = torch.zeros_like(h)
-        step[k] = 1e-5
-        up, down = families.log_variance_slopes(h + step), families.log_variance_slopes(h - step)
-        log = [2.0 * families.deviation(h + s).log().numpy() for s in (step, -step)]
-        np.testing.assert_allclose(first[:, k], (log[0] - log[1]) / 2e-5, rtol=1e-7, atol=1e-7)
-        np.testing.assert_allclose(second[:, k], (up[0] - down[0])[:, k] / 2e-5, rtol=1e-7, atol=1e-7)
-
-
 def test_evidence_is_that_of_the_linear_model() -> None:
     """-ln p of a Gaussian linear model, by the covariance of the data, up to a constant; and it is a maximum."""
     data, families = linear_case()

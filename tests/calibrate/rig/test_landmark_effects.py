@@ -56,21 +56,6 @@ def test_without_effect_the_same_points_contradict() -> None:
         solved(dataclasses.replace(landmarks(1.5), effects=()))
 
 
-def test_derivatives_are_those_of_differences() -> None:
-    problem, state = (lambda result: (result._solution.problem, result._solution.state))(solved(landmarks(0.8)))
-    block = problem.blocks[0]
-    rows = block.rows(problem.posed(state), state, problem.shared_size)[:, block.size]
-    step = 1e-4
-
-    def moved(sign: float) -> torch.Tensor:
-        other = state._replace(unknown=state.unknown + sign * step)
-        return block.residuals(problem.posed(other), other)
-
-    numeric = (moved(1.0) - moved(-1.0)) / (2 * step)
-    # Central differences of a projection: their own error is 1e-8 of the largest derivative.
-    torch.testing.assert_close(rows, numeric, rtol=1e-6, atol=1e-6)
-
-
 def test_sum_keeps_effects_with_their_landmarks() -> None:
     first, second = landmarks(0.5), landmarks(-0.5, seed=1)
     second = dataclasses.replace(second, names=tuple(f"q{i}" for i in range(COUNT)))
