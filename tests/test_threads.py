@@ -17,6 +17,7 @@ import pytest
 import scipy.linalg  # noqa: F401  has a BLAS of its own
 import torch
 from threadpoolctl import ThreadpoolController
+from waiting import PATIENCE
 
 from kcal.__main__ import _THREADS, main
 from kcal.calibrate.camera.calibrate import calibrate_camera
@@ -65,13 +66,13 @@ def test_it_is_one_in_blocks_within_blocks_and_as_before_after_them(several: lis
 
 def test_threads_that_overlap(several: list[int]) -> None:
     """The first to come is not the last to go, and who comes meanwhile gets back what it had."""
-    inside, leave = threading.Barrier(2, timeout=60.0), threading.Event()
+    inside, leave = threading.Barrier(2, timeout=PATIENCE), threading.Event()
     found: dict[str, list[int]] = {}
 
     def first() -> None:
         with one_thread():
             inside.wait()
-            leave.wait(60.0)
+            leave.wait(PATIENCE)
         found["first"] = numbers()
 
     def second() -> None:

@@ -20,6 +20,7 @@ from command_line import Command
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
+from waiting import PATIENCE
 
 from kcal.cli.main import app
 from kcal.corners import detect as module
@@ -537,7 +538,7 @@ def test_only_work_counts():
         limited(time.sleep, 2 * SCANT)
     left = [thread for thread in threading.enumerate() if thread.name == UNSTOPPABLE]
     for thread in left:
-        thread.join(60.0)
+        thread.join(PATIENCE)
     assert not any(thread.is_alive() for thread in left)
 
 

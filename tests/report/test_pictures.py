@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -148,24 +149,23 @@ _DATA = {"positions", "rig", "wide rig", "stations", "sites", "stars"}
 
 
 @functools.cache
-def drawn(name: str) -> Figure:
-    return FIGURES[name]()
+def drawn(name: str) -> tuple[tuple[int, int], list[tuple[str, Any]], list[Any]]:
+    """Width and height of a figure, texts with their boxes, and boxes of axes, in pixels."""
+    figure = FIGURES[name]()
+    return figure.canvas.get_width_height(), *boxes(figure)
 
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_no_text_is_cut(name: str) -> None:
-    figure = drawn(name)
-    wide, tall = figure.canvas.get_width_height()
-    cut = [text for text, box in boxes(figure)[0]
+    (wide, tall), texts, _ = drawn(name)
+    cut = [text for text, box in texts
            if box.x0 < -2 or box.y0 < -2 or box.x1 > wide + 2 or box.y1 > tall + 2]  # fmt: skip
     assert cut == []
 
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_no_axes_cover_each_other(name: str) -> None:
-    figure = drawn(name)
-    wide, tall = figure.canvas.get_width_height()
-    _, axes = boxes(figure)
+    (wide, tall), _, axes = drawn(name)
     for box in axes:
         assert -1 <= box.x0 < box.x1 <= wide + 1
         assert -1 <= box.y0 < box.y1 <= tall + 1
@@ -179,7 +179,7 @@ def test_no_axes_cover_each_other(name: str) -> None:
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_no_text_covers_another(name: str) -> None:
-    texts, _ = boxes(drawn(name))
+    _, texts, _ = drawn(name)
     covered = []
     for (first, one), (second, other) in itertools.combinations(texts, 2):
         across = min(one.x1, other.x1) - max(one.x0, other.x0)
