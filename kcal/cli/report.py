@@ -168,63 +168,56 @@ def _of_rig(
     from kcal.report.judge_rig import named_cameras
 
     rig = kcal.load_rig(path)
-    pair = rig.is_pair and rig.names == ("left", "right")
-    mark_sigma = pixel_sigma_of(pixel_sigma, rig)
     cameras = named_cameras(rig)
-    if pair and observations and len(observations) != 2:
-        raise InputError("a rig needs --observations LEFT RIGHT")
-    if not pair and observations:
-        cameras = [cameras[number] for number in cameras_of_files(observations, [name for name, _ in cameras])]
+    if rig.is_pair and rig.names == ("left", "right"):
+        if observations and len(observations) != 2:
+            raise InputError("a rig needs --observations LEFT RIGHT")
+    elif observations:
+        cameras = [cameras[number] for number in cameras_of_files(observations, rig.names)]
     if observations:
-        check_views_of(
-            [camera for _, camera in cameras], [kcal.Observations.load(file) for file in observations], observations
-        )
-    return judged_rig(rig, observations, needs, mark_sigma=mark_sigma, name=path.name.split(".")[0], cameras=cameras)
+        seen = [kcal.Observations.load(file) for file in observations]
+        check_views_of([camera for _, camera in cameras], seen, observations)
+    name = path.name.split(".")[0]
+    return judged_rig(rig, observations, needs, mark_sigma=pixel_sigma_of(pixel_sigma, rig), name=name, cameras=cameras)
 
 
 def judged_rig(
     rig: kcal.Rig, observations: Sequence[Path], needs: tuple[kcal.report.Requirement, ...], *, mark_sigma: float,
-    name: str, cameras: Sequence[tuple[str, kcal.Camera]],
+    name: str, cameras: Sequence[tuple[str, kcal.Camera]], result: RigResult | None = None,
 ) -> Judged:  # fmt: skip
-    """The verdict on a rig and, with the observations of `cameras`, each with its name, on these as well."""
-    found = judged_sides(cameras, observations, mark_sigma)
-    # Views of a rig that was solved without pairs may be of different moments, though their images are named alike.
-    if observations and len(rig) == 2 and (rig.calibration is None or rig.calibration.pairs > 0):
-        pairs, unpaired = _pairs(rig, observations)
-    else:
-        pairs, unpaired = None, ""
-    verdict = kcal.report.rig_verdict(
-        rig, needs, mark_sigma=mark_sigma, pairs=pairs, unpaired=unpaired, cameras=[one[0] for one in found],
-        subject=name,
-    )  # fmt: skip
-    tables = [table for one in found for table in one[2]]
-    return verdict, lambda: side_pictures(found), tables or stored_tables(rig)
+    """The verdict on a rig and, with the observations of `cameras`, each with its name, on these as well.
 
+    Of a rig that was just solved, `result` has its warnings, its pairs of boards, and what is drawn of it.
+    """
+    from kcal.report.judge_rig import named_cameras
+    from kcal.report.pages import camera_tables
+    from kcal.report.verdict_pictures import rig_pictures
 
-def judged_sides(
-    cameras: Sequence[tuple[str, kcal.Camera]], observations: Sequence[Path], mark_sigma: float
-) -> list[Judged]:
-    """The verdicts on cameras of a rig, calibrated again from their observations; none without these."""
     found = []
     with steps("cameras", len(observations)) as advance:
         for (side, camera), file in zip(cameras, observations, strict=False):
-            result, made = calibrated_again(camera, file, f"calibrating {side}")
-            found.append(judged(result, made, (), mark_sigma=mark_sigma, name=side, stored=camera))
+            again, made = calibrated_again(camera, file, f"calibrating {side}")
+            found.append(judged(again, made, (), mark_sigma=mark_sigma, name=side, stored=camera))
             advance("")
-    return found
+    pairs, unpaired = None, ""
+    # Views of a rig that was solved without pairs may be of different moments, though their images are named alike.
+    solved_apart = rig.calibration is not None and not rig.calibration.pairs
+    if result is None and observations and len(rig) == 2 and not solved_apart:
+        pairs, unpaired = _pairs(rig, observations)
+    verdict = kcal.report.rig_verdict(
+        rig, needs, mark_sigma=mark_sigma, result=result, pairs=pairs, unpaired=unpaired,
+        cameras=[one[0] for one in found], subject=name,
+    )  # fmt: skip
 
+    def drawn() -> dict[str, bytes]:
+        """With those of the cameras, named as findings of a rig name them."""
+        own = {f"{one.subject}-{picture}": data for one, make, _ in found for picture, data in make().items()}
+        return own if result is None else rig_pictures(result) | own
 
-def stored_tables(rig: kcal.Rig) -> list[list[list[str]]]:
-    """Tables of all cameras, as the rig's file has them."""
-    from kcal.report.judge_rig import named_cameras
-    from kcal.report.pages import camera_tables
-
-    return [table for name, camera in named_cameras(rig) for table in camera_tables(camera, name=name)]
-
-
-def side_pictures(cameras: Sequence[Judged]) -> dict[str, bytes]:
-    """The pictures of several cameras, named as findings of a rig name them."""
-    return {f"{verdict.subject}-{name}": data for verdict, pictures, _ in cameras for name, data in pictures().items()}
+    # Tables of cameras that were not calibrated again are as the rig's file has them.
+    again_made = [] if result is not None else [table for one in found for table in one[2]]
+    stored = (table for side, camera in named_cameras(rig) for table in camera_tables(camera, name=side))
+    return verdict, drawn, again_made or [*stored]
 
 
 def _pairs(rig: kcal.Rig, observations: Sequence[Path]) -> tuple[tuple[Tensor, Tensor] | None, str]:

@@ -19,7 +19,7 @@ from kcal.cli import console, kinds
 from kcal.cli.console import aligned, err, out, print_label, print_styled, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_and_source, pixel_sigma_of
 from kcal.cli.options import Command, Kind, Only, Rare, Several, declared, group_with_default
-from kcal.cli.report import NO, judged_sides, side_pictures, stored_tables, told_usable, warned_of
+from kcal.cli.report import NO, judged_rig, told_usable, warned_of
 from kcal.cli.rig_sources import Sources
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
@@ -210,20 +210,14 @@ def solve_and_write(
     print_wrote(output, picture)
     if needs or report is not None:
         from kcal.report.judge_rig import named_cameras
-        from kcal.report.verdict_pictures import rig_pictures
 
         pairs = sources.pairs or ()
-        sides = judged_sides(named_cameras(rig), pairs if two and _calibrated_from(rig, pairs) else (), noise)
-        verdict = kcal.report.rig_verdict(
-            rig, needs, mark_sigma=noise, result=result, cameras=[found[0] for found in sides],
-            subject=output.name.split(".")[0],
+        found = judged_rig(
+            rig, pairs if two and _calibrated_from(rig, pairs) else (), needs, mark_sigma=noise,
+            name=output.name.split(".")[0], cameras=named_cameras(rig), result=result,
         )  # fmt: skip
-        tell(verdict=verdict.to_dict())
-
-        def drawn() -> dict[str, bytes]:
-            return {**rig_pictures(result), **side_pictures(sides)}
-
-        if not told_usable((verdict, drawn, stored_tables(rig)), report, warned_of(result)):
+        tell(verdict=found[0].to_dict())
+        if not told_usable(found, report, warned_of(result)):
             raise typer.Exit(NO)
 
 
