@@ -39,6 +39,13 @@ _MAKERS = {
 }
 
 
+@functools.cache
+def named_modules(file: str) -> dict[str, str]:
+    """The names that the stub beside a file has, and in which module each is defined."""
+    lines = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8")).body
+    return {alias.name: str(line.module) for line in lines if isinstance(line, ast.ImportFrom) for alias in line.names}
+
+
 def door(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """The functions `__getattr__` and `__dir__` of a package (PEP 562), whose names stand in its stub.
 
@@ -47,21 +54,15 @@ def door(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], li
         file: its `__file__`.
     """
 
-    @functools.cache
-    def modules() -> dict[str, str]:
-        lines = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8")).body
-        return {
-            alias.name: str(line.module) for line in lines if isinstance(line, ast.ImportFrom) for alias in line.names
-        }
-
     def find(name: str) -> Any:
+        modules = named_modules(file)
         if name == "__all__":
-            return sorted(modules())
-        if name.startswith("__") or name not in modules():
+            return sorted(modules)
+        if name.startswith("__") or name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        if modules()[name] == package:
+        if modules[name] == package:
             return importlib.import_module(f"{package}.{name}")
-        module = importlib.import_module(modules()[name])
+        module = importlib.import_module(modules[name])
         value = getattr(module, name)
         if inspect.isfunction(value):
             value = _naming_slips(value)
@@ -77,7 +78,7 @@ def door(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], li
 
     def names() -> list[str]:
         # Without what the `__init__.py` itself imports, and without modules that happen to be loaded.
-        return sorted({*(name for name in vars(sys.modules[package]) if name.startswith("__")), *modules()})
+        return sorted({*(name for name in vars(sys.modules[package]) if name.startswith("__")), *named_modules(file)})
 
     return find, names
 

@@ -66,10 +66,12 @@ def read_imports() -> dict[str, set[str]]:
         module = ".".join(["kcal", *path.relative_to(PACKAGE).with_suffix("").parts])
         room = room_of(module)
         # Doors name what other rooms define, and belong to no room.
-        if path.name == "__main__.py" or path.with_suffix(".pyi").exists():
+        stub = path.with_suffix(".pyi")
+        if path.name == "__main__.py" or (path.name == "__init__.py" and stub.exists()):
             continue
         imported = rooms.setdefault(room, set())
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        # What commands take of the rooms stands in a stub.
+        for node in ast.walk(ast.parse((stub if stub.exists() else path).read_text(encoding="utf-8"))):
             names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             imported |= {room_of(name) for name in names if name.split(".")[0] == "kcal"} - {room}

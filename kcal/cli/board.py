@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 import kcal
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.console import board_words, ending_with, err, out, print_left_out, print_wrote, steps, tell, warn
 from kcal.cli.inputs import typed, typed_with
 from kcal.cli.options import Command, Kind, declared, group_with_default
@@ -55,14 +55,12 @@ def print_command(
         output: File to write, .svg or .pdf.
         paper: Size of the paper: A5, A4, A3, A2, A1, A0, letter, legal, tabloid, or auto for as large as needed.
     """
-    from kcal.corners.print_board import board_sheet, to_pdf, to_svg
-
     suffix = output.suffix.lower()
     if suffix not in (".svg", ".pdf"):
         raise InputError(f"{output}: give a file name that ends in .svg or .pdf")
     pattern = kcal.Board.parse(board, square)
-    sheet = board_sheet(pattern, paper)
-    write_atomic(output, to_svg(sheet.drawing) if suffix == ".svg" else to_pdf(sheet.drawing))
+    sheet = rooms.board_sheet(pattern, paper)
+    write_atomic(output, rooms.to_svg(sheet.drawing) if suffix == ".svg" else rooms.to_pdf(sheet.drawing))
     out.print(f"{output}: {pattern}, page {sheet.drawing.width:g}x{sheet.drawing.height:g} mm")
     if sheet.quiet < 1:
         white = (
@@ -93,21 +91,18 @@ def measure_command(
         output: Board file to write.
         picture: Heights as colors, print errors as arrows.
     """
-    from kcal.calibrate.hybrid.cameras_fit import fit_cameras
-    from kcal.report.calibration import board_figure, board_text
-
     sets = [kcal.Observations.load(path) for path in observations]
     names = [path.name.split(".")[0] for path in observations]
     if len(set(names)) < len(names):
         names = [str(path) for path in observations]
     with steps("measuring", 2 * len(sets) if len(sets) > 1 else 1) as advance:
-        found = fit_cameras(sets, names=names, advance=advance)
+        found = rooms.fit_cameras(sets, names=names, advance=advance)
     board = dataclasses.replace(found.boards[0], name=output.name.split(".")[0])
     kcal.calibrate.save_measured_board(board, output)
     if picture is not None:
-        kcal.report.save_picture(picture, board_figure(board))
+        kcal.report.save_picture(picture, rooms.board_figure(board))
     out.print(f"{board.board}, {len(board.observations)} of {len(sets)} observations: {', '.join(board.observations)}")
-    for line in board_text(board):
+    for line in rooms.board_text(board):
         out.print(f"  {line}")
     out.print(f"evidence against the board as ordered: {board.log_evidence:.0f} nats")
     for name, camera in zip(names, found.cameras, strict=True):
@@ -180,11 +175,7 @@ def detect_command(
     """
     given = given_board(board, square)
 
-    from kcal.bag import bag_and_topic
-    from kcal.corners.detect import Detection
-    from kcal.corners.images import expand_images, is_video, turned_images
-
-    failed: list[tuple[str, Path, Detection]] = []
+    failed: list[tuple[str, Path, rooms.Detection]] = []
 
     turned: list[Path] = []
     notes: list[str] = []
@@ -193,7 +184,7 @@ def detect_command(
         raise InputError(f"{streams[0]}: a stream is searched alone, without other images")
     if keep is not None:
         make_folder(keep)
-    bag = bag_and_topic(images[0]) if len(images) == 1 else None
+    bag = rooms.bag_and_topic(images[0]) if len(images) == 1 else None
     if topic and bag is None:
         raise InputError("--topic is of one bag: kcal detect run.mcap --topic /left/image_raw ...")
     if bag is not None and topic:
@@ -201,19 +192,17 @@ def detect_command(
     if len(topic or ()) > 1 and (gallery or coverage):
         raise InputError("--gallery and --coverage are of one camera: give one --topic")
     outputs = _of_each_camera(output, len(images)) if len(topic or ()) > 1 else [output]
-    if bag is not None or (len(images) == 1 and is_video(images[0])):
-        from kcal.corners.video import detect_videos
-
+    if bag is not None or (len(images) == 1 and rooms.is_video(images[0])):
         searched: list[str] = []
         pattern = given or board_in_images(images, square, time_limit)
         with steps(f"watching {streams[0]} for {duration:g} s" if streams else "searching the video", None):
-            observed = detect_videos(
+            observed = rooms.detect_videos(
                 images, pattern, refine, progress=searched.append, time_limit=time_limit, duration=duration,
                 keep=keep,
             )  # fmt: skip
         source = f"of {len(searched)} sharp {'moments' if len(images) > 1 else 'frames'} (repeats left out)"
     else:
-        paths = expand_images(images)
+        paths = rooms.expand_images(images)
         check_writable(output, *paths)
         pattern = given or board_in_images(paths, square, time_limit)
         with (
@@ -230,18 +219,16 @@ def detect_command(
                 on_failure=lambda name, path, found: failed.append((name, path, found)),
             )
         observed = [seen]
-        turned = turned_images([path for path in paths if os.path.isfile(path)])
+        turned = rooms.turned_images([path for path in paths if os.path.isfile(path)])
         source = f"of {len(paths)} images"
     for path, observations in zip(outputs, observed, strict=True):
         observations.save(path)
     if gallery is not None or coverage is not None:
-        from kcal.report.calibration import FailedImage, coverage_figure, gallery_figure
-
         if gallery is not None:
-            tiles = [FailedImage(name, path, found.reason, found.rejected) for name, path, found in failed]
-            kcal.report.save_picture(gallery, gallery_figure(observations, tiles))
+            tiles = [rooms.FailedImage(name, path, found.reason, found.rejected) for name, path, found in failed]
+            kcal.report.save_picture(gallery, rooms.gallery_figure(observations, tiles))
         if coverage is not None:
-            kcal.report.save_picture(coverage, coverage_figure(observations))
+            kcal.report.save_picture(coverage, rooms.coverage_figure(observations))
 
     views = [view for one in observed for view in one.views]
     failures = [failure for one in observed for failure in one.failures]
@@ -282,11 +269,8 @@ def given_board(size: str, square: str | None) -> kcal.Board | None:
 
 def board_in_images(images: Sequence[str | Path], square: str | None, time_limit: float | None = None) -> kcal.Board:
     """The board that images, a video or a stream show; it is said."""
-    from kcal.corners.images import is_video
-    from kcal.corners.recognize import Recognized
-    from kcal.corners.video import spread_frames
 
-    def say(found: Recognized) -> None:
+    def say(found: rooms.Recognized) -> None:
         if found.seen is not None:
             tell(board=found.seen.text)
             err.print(f"board {found.seen.text}, seen in {found.votes} of {found.looked} images that were looked at")
@@ -294,7 +278,7 @@ def board_in_images(images: Sequence[str | Path], square: str | None, time_limit
     first = images[0]
     with steps("looking for a board", None):
         return kcal.corners.recognize_board(
-            spread_frames(first) if is_video(first) else images, square, time_limit=time_limit, note=say
+            rooms.spread_frames(first) if rooms.is_video(first) else images, square, time_limit=time_limit, note=say
         )
 
 
@@ -310,9 +294,7 @@ def _next_command(
     found = re.search(r"a board of (\d+x\d+)", refusal) or re.search(r"give --board ((?:\w+:)?\d+x\d\S*)$", refusal)
     text = found[1] if found else ""
     if "COLUMNSxROWS" in refusal:
-        from kcal.corners.detect import recognize_images
-
-        seen = recognize_images(paths, _CURED).seen
+        seen = rooms.recognize_images(paths, _CURED).seen
         text = seen.text if seen is not None else ""
     if text and given in typed:
         return f"Perhaps: {typed_with({given: text})}"
@@ -321,13 +303,10 @@ def _next_command(
 
 def _of_each_size(images: Sequence[str], paths: Sequence[Path], output: Path) -> Iterator[str]:
     """A command for the images of each size, those of most first; sizes that may be of one camera stay together."""
-    from kcal.corners.detect import size_of
-    from kcal.corners.observations import nearly, resized_alike
-
     groups: dict[tuple[int, int], list[str]] = {}
     for path in paths:
-        if (size := size_of(path)) is not None:
-            alike = (other for other in groups if nearly(size, other) or resized_alike(size, other))
+        if (size := rooms.size_of(path)) is not None:
+            alike = (other for other in groups if rooms.nearly(size, other) or rooms.resized_alike(size, other))
             groups.setdefault(next(alike, size), []).append(str(path))
     for (width, height), files in sorted(groups.items(), key=lambda group: -len(group[1])):
         own = output.with_name(f"{output.name.split('.')[0]}-{width}x{height}.obs.json")

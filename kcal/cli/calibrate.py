@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import typer
 
 import kcal
-from kcal.cli import console, kinds
+from kcal.cli import console, kinds, rooms
 from kcal.cli.board import given_board
 from kcal.cli.console import err, out, print_styled, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import BOARD, calibrated_camera, check_file, pixel_sigma_of
@@ -20,34 +20,30 @@ from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_picture, check_writable, make_folder
 from kcal.texts import measured_text, number_text, percent_text
 
-if TYPE_CHECKING:
-    from kcal.calibrate.batch.results import SummaryRow
-    from kcal.calibrate.camera.result import CameraCalibrationResult
-
 _T = TypeVar("_T")
 
 
 # What `kcal calibrate` tells of a calibration: to persons, and to programs.
 
 
-def told_calibration(result: CameraCalibrationResult, beside: Path, *, reject: bool, verbose: bool) -> dict[str, Any]:
+def told_calibration(
+    result: rooms.CameraCalibrationResult, beside: Path, *, reject: bool, verbose: bool
+) -> dict[str, Any]:
     """Print what a person reads, and return what programs want to know.
 
     A long list of what was left out goes to a file beside the camera's.
     """
-    from kcal.calibrate.camera.trust import distances_text, summarize
-
     assert result.camera.calibration is not None
     record = result.camera.calibration.record
     assert record is not None
     width, height = result.observations.image_size
     out.print(f"{record.views} views, {record.points} corners, {width}x{height} px, model {result.camera.model}")
-    out.print(distances_text(result))
+    out.print(rooms.distances_text(result))
     # Warnings explain the others.
     ended = "converged" if result.status.name == "CONVERGED" else result.status.message
     fitted = f"; noise {result.noise:.4f} px along an axis; {ended} ({result.iterations} steps)"
     print_styled(f"RMS {result.rms:.4f} px{fitted}", r"(?<=^RMS )\S+ px")
-    brief = summarize(result)
+    brief = rooms.summarize(result)
     if brief.worst == brief.worst:
         center, border, worst = (number_text(one, digits=2) for one in (brief.center, brief.border, brief.worst))
         out.print(
@@ -109,7 +105,7 @@ def _without_nan(values: list[float]) -> list[float | None]:
     return [value if value == value else None for value in values]
 
 
-def _parameters(result: CameraCalibrationResult) -> list[list[str]]:
+def _parameters(result: rooms.CameraCalibrationResult) -> list[list[str]]:
     """Name, value and σ of each parameter."""
     rows = []
     values = dict(zip(result.camera.names, result.camera.params.tolist(), strict=True))
@@ -241,8 +237,6 @@ def calibrate_command(
         kcal.lens.LensModel.named(model)
     known = None if camera is None else calibrated_camera(camera)
 
-    from kcal.calibrate.camera.checks import OutlierRejection
-
     unknown = set(without or ()) - {"motion", "bending"}
     if unknown:
         raise InputError(f"--without {unknown.pop()}: write motion or bending")
@@ -262,7 +256,7 @@ def calibrate_command(
         weak_prior=weak_prior or None,
         camera=known,
         loss=None if loss is None else kcal.solve.RobustLoss(kind=loss, scale=loss_scale),  # type: ignore[arg-type]
-        reject=OutlierRejection(limit=reject_limit) if reject else None,
+        reject=rooms.OutlierRejection(limit=reject_limit) if reject else None,
     )
     sets = [kcal.Observations.load(place.observations) for place in places]
 
@@ -306,7 +300,7 @@ def calibrate_command(
             found = judged(
                 result, options, needs, baseline=baseline, mark_sigma=pixel_sigma_of(pixel_sigma), name=place.name
             )
-            figures[place.name]["verdict"] = found[0].to_dict()
+            figures[place.name]["verdict"] = found.verdict.to_dict()
             usable = told_usable(found, place.report, result.findings) and usable
     tell(cameras=figures)
     if failed:
@@ -402,22 +396,21 @@ def batch_command(
         scheduler: Dask scheduler whose workers see the same files: tcp://host:8786.
         time_limit: Seconds of processor time for one image or one calibration.
     """
-    from kcal.calibrate.batch.jobs import BatchOptions, pieces, read_jobs
-    from kcal.calibrate.batch.results import calibrate_batch
-
     given = given_board(board, square)
     if model != "hybrid":
         kcal.lens.LensModel.named(model)
     with steps("looking at the images", None):
-        jobs = read_jobs(cameras, given, model, square)
+        jobs = rooms.read_jobs(cameras, given, model, square)
     if given is None:
         for job in jobs:
             if job.board is not None:
                 out.print(f"{job.name}: board {job.board}")
-    options = BatchOptions(refine=refine, board_warp=board_warp, one_type=one_type, time_limit=time_limit)
+    options = rooms.BatchOptions(refine=refine, board_warp=board_warp, one_type=one_type, time_limit=time_limit)
     try:
-        with steps("images and cameras", pieces(jobs)) as advance:
-            report = calibrate_batch(jobs, output, options, workers=workers, scheduler=scheduler, progress=advance)
+        with steps("images and cameras", rooms.pieces(jobs)) as advance:
+            report = rooms.calibrate_batch(
+                jobs, output, options, workers=workers, scheduler=scheduler, progress=advance
+            )
     except KeyboardInterrupt:
         err.print("interrupted; what is finished is kept: run the same command to continue")
         raise typer.Exit(130) from None
@@ -432,7 +425,7 @@ def batch_command(
         )
 
 
-def _cells(row: SummaryRow) -> list[str]:
+def _cells(row: rooms.SummaryRow) -> list[str]:
     numbers = ["", "", "", "", ""]
     if row.rms is not None:
         spread = "" if row.sigma_focal is None else f"{row.sigma_focal:.3f}"

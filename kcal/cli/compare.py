@@ -6,7 +6,7 @@ import math
 from typing import Annotated, Any
 
 import kcal
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.console import out, print_wrote, steps, tell, tell_table, warn
 from kcal.cli.inputs import calibrated_camera, single_camera
 from kcal.cli.options import Kind, Several
@@ -77,9 +77,7 @@ def compare_command(
     if output is not None:
         write_atomic(output, table.csv)
     if picture is not None:
-        from kcal.report.calibration import models_figure
-
-        kcal.report.save_picture(picture, models_figure(result, observations.name))
+        kcal.report.save_picture(picture, rooms.models_figure(result, observations.name))
     print_wrote(output, picture)
     for name, reason in result.failures.items():
         warn(f"{name} could not be fitted to some of the views: {reason}")
@@ -116,8 +114,6 @@ def diff_command(
     """
     import torch
 
-    from kcal.lens.difference import difference_text
-
     cameras = [single_camera(source) for source in (first, second)]
     then, now = (_temperature(camera) for camera in cameras)
     for source, camera in zip((first, second), cameras, strict=True):
@@ -135,12 +131,10 @@ def diff_command(
     )
     if then is not None and now is not None and now != then:
         out.print(f"{abs(now - then):g} °C {'warmer' if now > then else 'colder'}")
-    for line in difference_text(found):
+    for line in rooms.difference_text(found):
         out.print(line)
     if picture is not None:
-        from kcal.report.calibration import difference_figure
-
-        print_wrote(kcal.report.save_picture(picture, difference_figure(found, title=f"{first} and {second}")))
+        print_wrote(kcal.report.save_picture(picture, rooms.difference_figure(found, title=f"{first} and {second}")))
 
 
 def _temperature(camera: kcal.Camera) -> float | None:
@@ -150,8 +144,6 @@ def _temperature(camera: kcal.Camera) -> float | None:
 
 def _history(camera: kcal.Camera) -> str:
     """Model, focal length and, if the file tells, when the camera was calibrated."""
-    from kcal.lens.uncertainty import paraxial_focal
-
     record = camera.calibration.record if camera.calibration else None
     when = ""
     if record:
@@ -160,7 +152,7 @@ def _history(camera: kcal.Camera) -> str:
         when += f", {camera.calibration.setting}"
     if record and record.temperature is not None:
         when += f", at {record.temperature:g} °C"
-    return f"{camera.model}, focal length {paraxial_focal(camera)}{when}"
+    return f"{camera.model}, focal length {rooms.paraxial_focal(camera)}{when}"
 
 
 # `kcal interpolate`: a camera at a setting of zoom or focus between those at which its lens was calibrated.
@@ -188,10 +180,8 @@ def interpolate_command(
     wanted = {name: one.value for name, one in stated.items()}
     spread = {name: one.sigma for name, one in stated.items() if one.sigma is not None}
 
-    from kcal.calibrate.camera.at_setting import camera_at_setting
-
     loaded = [kcal.load_camera(path) for path in cameras]
-    found = camera_at_setting(loaded, wanted, setting_sigma=spread, names=[str(path) for path in cameras])
+    found = rooms.camera_at_setting(loaded, wanted, setting_sigma=spread, names=[str(path) for path in cameras])
     *stood, made = [camera.calibration and camera.calibration.setting for camera in (*loaded, found.camera)]
     weights = [(weight, number_text(weight, 0.01, sign=True)) for weight in found.weights]
     columns = {name: name for name in ("camera", "setting", "weight")}

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -21,11 +21,8 @@ from rich.text import Text
 import kcal
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import replaced, write_atomic
+from kcal.table import Table
 from kcal.texts import one_line, visible
-
-if TYPE_CHECKING:
-    from kcal.table import Table
-
 
 # Printing for all commands: output, warnings, tables, JSON for programs, and progress bars for long work.
 

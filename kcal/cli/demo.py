@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+import kcal
 from kcal.cli import kinds
 from kcal.cli.options import Kind
 from kcal.files import make_folder
@@ -74,7 +75,6 @@ def demo_command(
     if images is None:
         simulated_site(output, seed)
         return
-    from kcal.corners.board import Board
 
     place = None if site is None else site.origin
-    real_pairs(output, images, board, square, Board.parse(board, square), place, heading)
+    real_pairs(output, images, board, square, kcal.Board.parse(board, square), place, heading)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import orjson
 
 import kcal
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import cameras_and_rig, named_source, picked
 from kcal.cli.options import Kind
@@ -81,11 +81,9 @@ def export_command(
         out.print(f"not in the file: {', '.join(done.lost)}")
     fitted = [(camera, misfit) for camera, misfit in zip(names, done.misfits, strict=True) if misfit is not None]
     if picture is not None and fitted:
-        from kcal.report.calibration import difference_figure
-
         camera, misfit = max(fitted, key=lambda each: each[1].largest)
         title = f"{source}: {camera}" if len(names) > 1 else source
-        print_wrote(kcal.report.save_picture(picture, difference_figure(misfit, title=title)))
+        print_wrote(kcal.report.save_picture(picture, rooms.difference_figure(misfit, title=title)))
     elif picture is not None:
         out.print("no picture: nothing was refitted")
     print_wrote(*done.paths)
@@ -144,9 +142,7 @@ def import_command(
     if what and len(paths) > 1:
         raise InputError(f"{what} are read from one file{', with --board and --square' if board is not None else ''}")
     if board is not None:
-        from kcal.corners.foreign_corners import import_corners
-
-        seen = import_corners(paths[0], kcal.Board.parse(board, square), size)
+        seen = rooms.import_corners(paths[0], kcal.Board.parse(board, square), size)
         seen.save(output)
         weights = "with weights" if seen.covariances() is not None else "without weights"
         corners = sum(int(view.seen.sum()) for view in seen.views)
@@ -182,8 +178,6 @@ def _import_cameras(paths: list[Path], camera: str | None, output: Path, **state
 
 
 def _import_survey(source: Path, output: Path, sigma: float | None, geoid: float | None) -> None:
-    from kcal.locate.survey import EARTH, places_csv
-
     survey = kcal.rig.import_survey(source, sigma=sigma, geoid=geoid)
     assert survey.origin is not None
     places = kcal.locate.enu_to_geodetic(survey.points, survey.origin).tolist()
@@ -191,7 +185,7 @@ def _import_survey(source: Path, output: Path, sigma: float | None, geoid: float
         [name, f"{lat:.11f}", f"{lon:.11f}", f"{height:.5f}", level, up]
         for name, (lat, lon, height), (level, _, up) in zip(survey.names, places, survey.sigma.tolist(), strict=True)
     )
-    write_atomic(output, places_csv(EARTH, rows))
+    write_atomic(output, rooms.places_csv(rooms.EARTH, rows))
     out.print(f"{len(places)} places")
 
 

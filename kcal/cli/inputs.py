@@ -8,17 +8,14 @@ import os
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import kcal
+from kcal.cli import rooms
 from kcal.cli.console import err, warn
 from kcal.errors import FileError, InputError
 from kcal.file_kind import WORDS, file_kind
 from kcal.files import is_stream
-
-if TYPE_CHECKING:
-    from kcal.io.foreign import ImportedCameras
-
 
 # Cameras from files of kcal or of other programs, as commands name them: FILE, or FILE:CAMERA.
 
@@ -31,7 +28,7 @@ def named_source(source: str) -> tuple[Path, str | None]:
     return Path(source), None
 
 
-def picked(found: ImportedCameras, name: str | None, source: str) -> kcal.Camera:
+def picked(found: rooms.ImportedCameras, name: str | None, source: str) -> kcal.Camera:
     """The only camera, or the one of that name; of a rig `left` and `right` name the cameras as well.
 
     Raises:
@@ -54,15 +51,13 @@ def picked(found: ImportedCameras, name: str | None, source: str) -> kcal.Camera
     return found.cameras[names.index(name)]
 
 
-def cameras_and_rig(path: Path) -> tuple[ImportedCameras, kcal.Rig | None]:
+def cameras_and_rig(path: Path) -> tuple[rooms.ImportedCameras, kcal.Rig | None]:
     """The cameras of a file of any program, and the rig that they are, if they are one."""
-    from kcal.io.formats import recognized
-
     found = kcal.lens.import_cameras(path)
     warn(*found.notes)
     if len(found.cameras) == 1:
         return found, None
-    if recognized(path) == "kcal":
+    if rooms.recognized(path) == "kcal":
         return found, kcal.load_rig(path)
     return found, found.rig() if found.is_rig() else None
 
@@ -90,9 +85,8 @@ def calibrated_camera(source: str | Path) -> kcal.Camera:
         return kcal.load_camera(path)
     if name not in ("left", "right"):
         raise InputError(f"{source}: a rig has the cameras left and right, and none named {name!r}")
-    from kcal.io.rig_file import load_pair
 
-    rig = load_pair(path)
+    rig = rooms.load_pair(path)
     return rig.left if name == "left" else rig.right
 
 
@@ -299,10 +293,9 @@ def check_kinds(found: Sequence[_Given]) -> None:
     inside = next(_candidates(wrong, kind), None)
     if inside is not None and typed:
         raise FileError(f"{text}. Perhaps: {typed_with({wrong.text: inside})}")
-    from kcal.locate.marks import is_long
 
     tables = [one.path for one in found if wrong.wanted is RIG and one.wanted is MARKS and one.fits(one.text)]
-    marks = next(filter(is_long, tables), None)
+    marks = next(filter(rooms.is_long, tables), None)
     raise FileError(f"{text}. To make one: {wrong.wanted.cure(wrong.path, kind, marks)}")
 
 

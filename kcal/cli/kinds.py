@@ -5,18 +5,15 @@ from __future__ import annotations
 import datetime
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
+import kcal
 from kcal import values
 from kcal.cli import inputs
 from kcal.cli.options import Kind
 from kcal.errors import InputError
 from kcal.files import check_picture
 from kcal.values import WithSigma
-
-if TYPE_CHECKING:
-    from kcal.lens.rig import Origin
-    from kcal.report.verdict import Requirement
 
 _T = TypeVar("_T")
 
@@ -110,29 +107,27 @@ class KnownPlace(NamedTuple):
         sigma: of each axis, meters; None where that was not stated.
     """
 
-    origin: Origin
+    origin: kcal.Origin
     sigma: float | None = None
 
 
 def read_place(text: str, name: str) -> KnownPlace:
     """`LAT,LON,HEIGHT`, or `LAT,LON,HEIGHT±SIGMA`."""
-    from kcal.lens.rig import Origin
-
     lat, lon, height, sigma = values.place_on_earth(text, name)
-    return KnownPlace(Origin(lat=lat, lon=lon, height=height), sigma)
+    return KnownPlace(kcal.Origin(lat=lat, lon=lon, height=height), sigma)
 
 
 Place = Annotated[KnownPlace, Kind(metavar="LAT,LON,HEIGHT[±M]", read=read_place)]
 
 
-def _read_origin(text: str, name: str) -> Origin:
+def _read_origin(text: str, name: str) -> kcal.Origin:
     known = read_place(text, name)
     if known.sigma is not None:
         raise InputError(f"{name} {text!r}: no ± is used here; write LAT,LON,HEIGHT")
     return known.origin
 
 
-Site = Annotated["Origin", Kind(metavar="LAT,LON,HEIGHT", read=_read_origin)]
+Site = Annotated["kcal.Origin", Kind(metavar="LAT,LON,HEIGHT", read=_read_origin)]
 
 
 # Boards.
@@ -160,10 +155,8 @@ RefineMethod = Annotated[
 ]
 
 
-def _read_needs(text: str, _name: str) -> tuple[Requirement, ...]:
-    from kcal.report.verdict import Requirement
-
-    return Requirement.parse(text)
+def _read_needs(text: str, _name: str) -> tuple[kcal.report.Requirement, ...]:
+    return kcal.report.Requirement.parse(text)
 
 
 Needs = Annotated[tuple[Any, ...], Kind(metavar="RANGE:ERROR", read=_read_needs, setting=True)]

@@ -7,12 +7,12 @@ import sys
 import time as clocks
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 import kcal
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.console import err, on_signals, steps
 from kcal.cli.inputs import pixel_sigma_of
 from kcal.cli.locate import LocateOptions, pair_localizer
@@ -20,13 +20,6 @@ from kcal.cli.options import Kind, Only, Rare, taken
 from kcal.errors import InputError, with_extra
 from kcal.files import check_writable
 from kcal.texts import measured_text
-
-if TYPE_CHECKING:
-    from kcal.locate.tables import PositionColumns
-    from kcal.pipeline.senders import LiveMap
-    from kcal.pipeline.stream import Stream, StreamCounts
-    from kcal.pipeline.tracks import Tracks
-    from kcal.pipeline.video_source import Videos
 
 
 def live_command(
@@ -94,11 +87,6 @@ def live_command(
         compile: Translate the filter to C++ first, which takes minutes; for many targets.
         start: Calendar time of second 0, if times are not Unix seconds; for events.
     """
-    from kcal.locate.points import PointLocator
-    from kcal.pipeline.grouping import read_moment
-    from kcal.pipeline.senders import sender_to
-    from kcal.pipeline.stream import Stream, lines_of
-
     if (detections is None) == (not videos):
         raise typer.BadParameter("give videos and --detector, or --detections")
     known = kcal.load_rig(rig)
@@ -123,24 +111,24 @@ def live_command(
     follow = kcal.track.TrackOptions.for_video(match_sigma) if videos else None
     moments, moving = None, 0
     if options.history is not None:
-        from kcal.watch.watcher import MORE_ERRORS, Followed
-
         # The rig as it stands at each second, by a history that grows, and how many errors more that has.
-        moments, moving = Followed(options.history, localize), MORE_ERRORS
+        moments, moving = rooms.Followed(options.history, localize), rooms.MORE_ERRORS
     tracker = kcal.track.Tracker(localize, follow, clock=clock, compiled=compile, moments=moments, moving=moving)
     frames = _videos(videos, detector, solved, tracker, joining, match_sigma) if videos and detector else None
-    source = frames or lines_of(lines, lambda line: read_moment(line, solved, joining, float(localize.pixel_sigma)))
+    source = frames or rooms.lines_of(
+        lines, lambda line: rooms.read_moment(line, solved, joining, float(localize.pixel_sigma))
+    )
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
     with steps("live", lines.stat().st_size if lines is not None and lines.is_file() else None) as advance:
-        stream = Stream(
-            tracker, PointLocator(localize).located(), output, log,
-            senders=[sender_to(address) for address in to or []], start=start, shown=None,
+        stream = rooms.Stream(
+            tracker, rooms.PointLocator(localize).located(), output, log,
+            senders=[rooms.sender_to(address) for address in to or []], start=start, shown=None,
         )  # fmt: skip
         page = None
         if port is not None:
             with with_extra("mark", "--port needs"):
-                from kcal.pipeline.senders import LiveMap
-            page = LiveMap(stream.run, port, start)
+                pass
+            page = rooms.LiveMap(stream.run, port, start)
             err.print(f"live map: {page.address}")
         stream.shown = _progress(advance, stream, page)
         if stream.ledger.place.sequence:
@@ -183,7 +171,7 @@ def live_command(
             err.print(f"{whose} images are {late} later than their times say")
 
 
-def summary(counts: StreamCounts) -> str:
+def summary(counts: rooms.StreamCounts) -> str:
     """What happened, in one line."""
     parts = [f"{counts.moments:,} moments, {counts.positions:,} positions"]
     for count, what in (
@@ -200,11 +188,9 @@ def summary(counts: StreamCounts) -> str:
 
 def _localizer(path: Path, rig: kcal.Rig, options: LocateOptions, *, many: bool) -> kcal.Localizer:
     """Of two cameras, or of many."""
-    from kcal.locate.stations import stations_of
-
     if not many:
         return pair_localizer(rig, options, pixel_sigma_of(options.pixel_sigma, rig))(rig)
-    known = stations_of(rig)
+    known = rooms.stations_of(rig)
     if known.origin is None:
         raise InputError(
             f"{path}: this rig has no place on the Earth; solve it with landmarks or positions with latitudes"
@@ -219,10 +205,9 @@ def _videos(
     tracker: kcal.track.Tracker,
     options: kcal.track.AssociationOptions,
     match_sigma: float,
-) -> Videos:
+) -> rooms.Videos:
     with with_extra("video", "videos need"):
-        from kcal.pipeline.video_source import Videos
-    from kcal.pipeline.detections import load_detector
+        pass
 
     # As `python -m` does: a detector beside which the command is run is found.
     sys.path.insert(0, os.getcwd())
@@ -234,16 +219,18 @@ def _videos(
     def tell(text: str) -> None:
         err.print(text)
 
-    return Videos(videos, rig, load_detector(detector), options, late=late, match_sigma=match_sigma, tell=tell)
+    return rooms.Videos(
+        videos, rig, rooms.load_detector(detector), options, late=late, match_sigma=match_sigma, tell=tell
+    )
 
 
 def _progress(
-    advance: Callable[..., None], stream: Stream, page: LiveMap | None
-) -> Callable[[PositionColumns, Tracks], None]:
+    advance: Callable[..., None], stream: rooms.Stream, page: rooms.LiveMap | None
+) -> Callable[[rooms.PositionColumns, rooms.Tracks], None]:
     """Show the tracks on the map, and how it goes, twice a second."""
     next_time, read = 0.0, 0
 
-    def show(columns: PositionColumns, tracks: Tracks) -> None:
+    def show(columns: rooms.PositionColumns, tracks: rooms.Tracks) -> None:
         nonlocal next_time, read
         if page is not None:
             page.show(columns, stream.counts.moments, tracks.time)

@@ -6,12 +6,12 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, NamedTuple
 
 import typer
 
 import kcal
-from kcal.cli import console, kinds
+from kcal.cli import console, kinds, rooms
 from kcal.cli.console import err, json_asked, out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_and_source
 from kcal.cli.options import Kind, Rare, settings_file, taken
@@ -19,17 +19,14 @@ from kcal.errors import DegenerateError, InputError
 from kcal.files import written_files
 from kcal.texts import one_line
 
-if TYPE_CHECKING:
-    from torch import Tensor
 
-    from kcal.locate.points import PointLocator
-    from kcal.locate.positions import Located
-    from kcal.locate.tables import PositionColumns
+class LocatedPart(NamedTuple):
+    """Positions; where bearings count from, of several cameras; whether the table states noise; how far it is read."""
 
-    # Positions; where bearings count from, of several cameras; whether the table states the noise of its marks; and how
-    # far it has been read.
-    LocatedPart = tuple[PositionColumns, Tensor | None, bool, int]
-    Locate = Callable[[kcal.locate.Marks], tuple[PositionColumns, Tensor | None]]
+    columns: rooms.PositionColumns
+    feet: rooms.Tensor | None
+    stated: bool
+    read: int
 
 
 # What `kcal locate` prints and draws of positions.
@@ -40,13 +37,12 @@ def counts_text(rows: int, statuses: dict[str, int]) -> str:
     return f"{rows:,} rows: " + ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in statuses.items())
 
 
-def _print_positions(located: Located, true: Tensor | None, statuses: dict[str, int], *, stated: bool) -> None:
+def _print_positions(
+    located: rooms.Located, true: rooms.Tensor | None, statuses: dict[str, int], *, stated: bool
+) -> None:
     """Print the table with the reasons below it; of a long one the counts, and the rows that have a true position."""
-    from kcal.locate.positions import position_errors
-    from kcal.report.tables import position_rows
-
-    errors = None if true is None else position_errors(located, true)
-    rows = position_rows(located, errors)
+    errors = None if true is None else rooms.position_errors(located, true)
+    rows = rooms.position_rows(located, errors)
     shown: Sequence[int] = range(len(located.positions))
     if located.rows is not None:
         out.print(counts_text(located.rows, statuses))
@@ -69,9 +65,7 @@ def _print_positions(located: Located, true: Tensor | None, statuses: dict[str, 
 
 
 def _read_aging(text: str, name: str) -> float:
-    from kcal.watch.turned import parse_aging
-
-    return parse_aging(text, name)
+    return rooms.parse_aging(text, name)
 
 
 _SETTING = Kind(setting=True)
@@ -130,30 +124,27 @@ class LocateOptions:
             )
 
 
-def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[PointLocator, Iterator[LocatedPart], str]:
+def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[rooms.PointLocator, Iterator[LocatedPart], str]:
     """Read a rig and begin a table: marks of several cameras, or of one with a height or a terrain, or pairs.
 
     Returns:
         by which it is located; what locates it, part by part; and where the noise of marks is from, to be said if the
         table does not state it.
     """
-    from kcal.locate.marks import is_long, read_mark_chunks
-    from kcal.locate.points import PointLocator
-
     solved = kcal.load_rig(rig)
     stated = own.height is not None or own.terrain is not None
-    many = stated or is_long(points) or len(solved) != 2 or not solved.in_first_frame
+    many = stated or rooms.is_long(points) or len(solved) != 2 or not solved.in_first_frame
     if many:
         refuse_of_pairs(own)
     elif own.aged is not None and own.history is not None:
         raise typer.BadParameter("--aged guesses what --history tells: give either")
     noise, note = pixel_sigma_and_source(own.pixel_sigma, solved)
     warn(*(f"{rig}: {text}" for text in (solved.calibration.warnings if solved.calibration else ())))
-    by_moments: Locate | None = None
+    by_moments: Callable[[kcal.locate.Marks], tuple[rooms.PositionColumns, rooms.Tensor | None]] | None = None
     geoid = kcal.locate.find_geoid(own.geoid_grid)
     if many:
         ground = None if own.terrain is None else kcal.locate.terrain(own.terrain, own.geoid)
-        locate = PointLocator(
+        locate = rooms.PointLocator(
             kcal.Localizer(solved, weights="all", pixel_sigma=noise), geoid=geoid, ground=ground,
             height=own.height if ground is None else (0.0, own.terrain_sigma),
         )  # fmt: skip
@@ -161,18 +152,19 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[PointLocato
         localize = pair_localizer(solved, own, noise)
         if own.history is not None:
             # Loads OpenCV and SciPy, which nothing else here needs.
-            from kcal.watch.watcher import located_at
 
             if solved.covariance is None:
                 # Not exact: moments add what is not known of them.
                 solved.covariance = kcal.rig.RigCovariance.of(solved)
-            by_moments = located_at(own.history, solved, lambda rig: PointLocator(localize(rig), geoid=geoid))
-        locate = PointLocator(localize(solved), geoid=geoid)
+            by_moments = rooms.located_at(
+                own.history, solved, lambda rig: rooms.PointLocator(localize(rig), geoid=geoid)
+            )
+        locate = rooms.PointLocator(localize(solved), geoid=geoid)
 
     def parts() -> Iterator[LocatedPart]:
-        for marks, read in read_mark_chunks(points, solved.names, single=many):
+        for marks, read in rooms.read_mark_chunks(points, solved.names, single=many):
             columns, feet = (by_moments or locate)(marks)
-            yield columns, feet, marks.covariance_or(noise) is not None, read
+            yield LocatedPart(columns, feet, marks.covariance_or(noise) is not None, read)
 
     return locate, parts(), note
 
@@ -197,9 +189,6 @@ def pair_localizer(solved: kcal.Rig, own: LocateOptions, noise: float) -> Callab
         own: where it stands, if not as its file says, and what errors come on top.
         noise: of marks, px.
     """
-    from kcal.locate.mounting import run_errors
-    from kcal.locate.tabulate import true_from_grid
-
     yaw_sigma = math.hypot(own.yaw_sigma, own.aged or 0.0)
     site, heading = own.site, own.heading
     if solved.mounting is not None and {"site", "heading"} <= taken:
@@ -208,11 +197,11 @@ def pair_localizer(solved: kcal.Rig, own: LocateOptions, noise: float) -> Callab
         err.print(f"the position of the rig is that in its file, not that in {settings_file()}")
     azimuth = None if heading is None else heading.value
     if site is not None and azimuth is not None and own.grid is not None:
-        azimuth = true_from_grid(azimuth, site.origin, own.grid)
+        azimuth = rooms.true_from_grid(azimuth, site.origin, own.grid)
     refraction, refraction_sigma = own.refraction or (None, None)
 
     def localize(standing: kcal.Rig) -> kcal.Localizer:
-        errors = run_errors(
+        errors = rooms.run_errors(
             standing, yaw_deg=yaw_sigma, heading_deg=heading.sigma or 0.0 if heading else 0.0,
             origin_m=site.sigma or 0.0 if site else 0.0, elsewhere=site is not None,
         )  # fmt: skip
@@ -292,39 +281,32 @@ def locate_command(
         image: With --map: GeoTIFF to embed.
         online: With --map: let the page load tiles of OpenStreetMap.
     """
-    from kcal.locate.export import STREAM, check_format, check_place, open_writers
-    from kcal.locate.points import PositionSample
-    from kcal.locate.positions import NOWHERE, read_truth
-    from kcal.locate.survey import read_survey
-
     outputs = output or []
-    streamed = STREAM in outputs
+    streamed = rooms.STREAM in outputs
     suffix = f".{format}"
-    if streamed and (json_asked() or outputs.count(STREAM) > 1):
+    if streamed and (json_asked() or outputs.count(rooms.STREAM) > 1):
         raise typer.BadParameter("-o - takes the standard output for itself; leave out --json and a second -o -")
     if streamed:
         console.end_line()
-    named = [f"positions{suffix}" if path == STREAM else path for path in outputs]
+    named = [f"positions{suffix}" if path == rooms.STREAM else path for path in outputs]
     for name in named:
-        check_format(name)
+        rooms.check_format(name)
     if map_ is not None:
-        from kcal.report.map_page import check_map_format
-
-        check_map_format(map_)
+        rooms.check_map_format(map_)
     locate, parts, note = locate_run(rig, points, options)
     empty = locate.located()
     for name in named:
-        check_place(name, empty)
+        rooms.check_place(name, empty)
     if not empty.origin:
         for option, given in (("--map", map_), ("--picture", picture), ("--truth", truth)):
             if given is not None:
-                raise InputError(f"{option}: {NOWHERE}")
-    survey = None if truth is None else read_survey(truth, empty.origin, measured=False)
-    sample = PositionSample(frozenset(survey.names if survey else ()))
+                raise InputError(f"{option}: {rooms.NOWHERE}")
+    survey = None if truth is None else rooms.read_survey(truth, empty.origin, measured=False)
+    sample = rooms.PositionSample(frozenset(survey.names if survey else ()))
     with written_files() as written:
         try:
             size = points.stat().st_size if points.is_file() else None
-            with open_writers(outputs, empty, suffix) as writers, steps("locating", size) as advance:
+            with rooms.open_writers(outputs, empty, suffix) as writers, steps("locating", size) as advance:
                 read, stated = 0, False
                 for columns, feet, known, end in parts:
                     stated = stated or known
@@ -336,11 +318,9 @@ def locate_command(
                 if note and not stated:
                     err.print(note)
                 located = sample.located(locate)
-                true = None if truth is None else read_truth(truth, located)
+                true = None if truth is None else rooms.read_truth(truth, located)
             if picture is not None:
-                from kcal.report.positions import stations_figure
-
-                draw = kcal.report.positions_figure if located.feet is None else stations_figure
+                draw = kcal.report.positions_figure if located.feet is None else rooms.stations_figure
                 kcal.report.save_picture(picture, draw(located, true))
             if map_ is not None:
                 kcal.report.save_map(map_, located, true, tiles=tiles, image=image, online=online)

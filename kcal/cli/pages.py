@@ -6,19 +6,15 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import kcal
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.board import board_in_images, given_board
 from kcal.cli.console import err, out, show_page, warn
 from kcal.cli.inputs import IMAGES, pixel_sigma_of
 from kcal.cli.options import Kind
 from kcal.errors import InputError, KcalError, with_extra
-
-if TYPE_CHECKING:
-    from kcal.capture.session import CaptureSession
-    from kcal.web.serving import LocalServer
 
 _MARK_PORT, _CAPTURE_PORT = 8347, 8348
 
@@ -77,25 +73,22 @@ def mark_command(
     """
     with with_extra("mark", "kcal mark needs"):
         from kcal.mark.server import marking_app
-        from kcal.web.serving import LocalServer
-    from kcal.io.rig_file import load_pair
-    from kcal.mark.guide import Reference, open_pictures
-    from kcal.mark.marking_service import Desk
-    from kcal.mark.session import Session
 
     if rig is not None and cameras is not None:
         raise InputError("give --rig or --cameras, not both: a rig file contains its cameras")
     if (reference is None) != (reference_images is None):
         raise InputError("--reference and --reference-images belong together: old marks, and the images they are in")
-    pictures = open_pictures(left, right)
-    known = None if rig is None else load_pair(rig)
+    pictures = rooms.open_pictures(left, right)
+    known = None if rig is None else rooms.load_pair(rig)
     own = None if cameras is None else (kcal.load_camera(cameras[0]), kcal.load_camera(cameras[1]))
-    old = None if reference is None or reference_images is None else Reference(reference, *reference_images)
-    session = Session(output, landmarks, pixel_sigma_of(pixel_sigma, known), targets)
-    desk = Desk(pictures, session, own, known, old)
+    old = None if reference is None or reference_images is None else rooms.Reference(reference, *reference_images)
+    session = rooms.Session(output, landmarks, pixel_sigma_of(pixel_sigma, known), targets)
+    desk = rooms.Desk(pictures, session, own, known, old)
     try:
         desk.check_sizes()
-        server = LocalServer(lambda token, hosts: marking_app(desk, token, hosts), port, fallback=port == _MARK_PORT)
+        server = rooms.LocalServer(
+            lambda token, hosts: marking_app(desk, token, hosts), port, fallback=port == _MARK_PORT
+        )
         show_page(server.address, "marking page", browser=browser)
         if session.version:
             err.print(f"continued after {session.version} actions in {session.files.log}")
@@ -147,13 +140,11 @@ def capture_command(
         port: Of the local address; 0 for any that is free.
         browser: Open the page in the browser.
     """
-    from kcal.capture.session import CaptureOptions, CaptureSession, follow, shots
-
     pattern = given_board(board, square)
     if pattern is None and output.exists():
         pattern = kcal.Observations.load(output).board
     pattern = pattern or board_in_images([source], square)
-    session = CaptureSession(output, pattern, CaptureOptions(until=until, most=most, refine=refine))
+    session = rooms.CaptureSession(output, pattern, rooms.CaptureOptions(until=until, most=most, refine=refine))
     if session.views:
         err.print(f"{output} has {session.views} views; going on")
     stop = threading.Event()
@@ -164,20 +155,22 @@ def capture_command(
 
     def watch() -> None:
         try:
-            for shot in shots(source, over, lambda text: err.print(text)):
+            for shot in rooms.shots(source, over, lambda text: err.print(text)):
                 if session.offer(shot.image, shot.name, moving=shot.moving):
                     out.print(f"{session.views}: {shot.name}")
         except KcalError as error:
             failed.append(error)
         stop.set()
 
-    threads = [threading.Thread(target=watch), threading.Thread(target=follow, args=(session,), kwargs={"until": over})]
+    threads = [
+        threading.Thread(target=watch),
+        threading.Thread(target=rooms.follow, args=(session,), kwargs={"until": over}),
+    ]
     server = None
     if page:
         with with_extra("mark", "the page needs", ", or give --no-page"):
             from kcal.capture.session import capture_app
-            from kcal.web.serving import LocalServer
-        server = LocalServer(
+        server = rooms.LocalServer(
             lambda token, hosts: capture_app(session, stop, token, hosts), port, fallback=port == _CAPTURE_PORT
         )
         show_page(server.address, "capture page", browser=browser)
@@ -211,7 +204,7 @@ def capture_command(
     out.print(f"next: kcal calibrate {output} -o {output.with_name(camera)}", soft_wrap=True)
 
 
-def _stop_server(threads: list[threading.Thread], server: LocalServer) -> None:
+def _stop_server(threads: list[threading.Thread], server: rooms.LocalServer) -> None:
     """Stop the server when all is captured, a moment later: the page still asks how it ended."""
     for thread in threads:
         thread.join()
@@ -219,7 +212,7 @@ def _stop_server(threads: list[threading.Thread], server: LocalServer) -> None:
     server.stop()
 
 
-def _tell(session: CaptureSession, over: Callable[[], bool]) -> None:
+def _tell(session: rooms.CaptureSession, over: Callable[[], bool]) -> None:
     """Print what to photograph next, whenever it changes."""
     said = ""
     while not over():

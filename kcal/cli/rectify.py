@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import kcal
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.console import err, out, print_styled, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import cameras_and_rig, named_source, single_camera
 from kcal.cli.options import Kind
@@ -58,12 +58,10 @@ def convert_images(
     Returns:
         how many were done before, and what was wrong with those that failed.
     """
-    from kcal.corners.images import image_bytes
-
     before, failures, view = 0, list[str](), _view_key(module)
     for path, target in zip(paths, targets, strict=True):
         try:
-            data = image_bytes(path)
+            data = rooms.image_bytes(path)
             note = f"kcal rectify {hashlib.sha256(view.encode() + data).hexdigest()}"
             if target.exists() and note.encode() in read_bytes(target)[:_HEAD]:
                 before += 1
@@ -79,15 +77,12 @@ def convert_images(
 def _convert(data: bytes, path: Path, target: Path, module: kcal.lens.Undistort, note: str) -> None:
     import torch
 
-    from kcal.corners.images import decode_image
-    from kcal.io.images import write_png
-
-    image = torch.from_numpy(decode_image(data, path))
+    image = torch.from_numpy(rooms.decode_image(data, path))
     (height, width), size = image.shape[:2], module.camera.size
     if (width, height) != size:
         raise InputError(f"{path}: the image is {width}x{height} px, the camera {size[0]}x{size[1]} px")
     new, _ = module(image[None] if image.ndim == 2 else image.permute(2, 0, 1))
-    write_png(target, (new[0] if image.ndim == 2 else new.permute(1, 2, 0)).contiguous().numpy(), note=note)
+    rooms.write_png(target, (new[0] if image.ndim == 2 else new.permute(1, 2, 0)).contiguous().numpy(), note=note)
 
 
 # `kcal rectify`: images as another camera takes them: without distortion, turned, in stereo, on a cylinder.
@@ -214,20 +209,16 @@ def _resampled(
 
 
 def _rectify_camera(source: str, images: list[str], folder: Path, options: ViewOptions) -> None:
-    from kcal.corners.images import expand_images
-
     if not images and not options.maps:
         raise InputError("name the images, or write the maps alone with --maps")
     look = options.pan, options.tilt
     if any(look) and options.fov is None:
         raise InputError("--pan and --tilt need --fov: which part of the image is to be shown")
-    sides = {folder: expand_images(images)} if images else {}
+    sides = {folder: rooms.expand_images(images)} if images else {}
     path, part = named_source(source)
     name = part or path.name.removesuffix(".json").removesuffix(".camera")
     camera_path = folder / f"{name}_rectified.json"
     extras = [*([] if options.cylinder else [camera_path]), *_extra_paths(folder, name, options)]
-
-    from kcal.lens.views import new_pinhole
 
     old = single_camera(source)
 
@@ -237,7 +228,9 @@ def _rectify_camera(source: str, images: list[str], folder: Path, options: ViewO
             view: Any = kcal.lens.cylinder_view(old, fov, size)
         else:
             view = (
-                new_pinhole(old, options.alpha, size) if fov is None else kcal.lens.pinhole_view(fov, size or old.size)
+                rooms.new_pinhole(old, options.alpha, size)
+                if fov is None
+                else kcal.lens.pinhole_view(fov, size or old.size)
             )
         return view, [
             kcal.lens.Undistort(old, view, kcal.lens.looking(*look) if any(look) else None, at=options.distance)
@@ -257,13 +250,11 @@ def _rectify_camera(source: str, images: list[str], folder: Path, options: ViewO
 
 
 def _rectify_rig(rig: kcal.Rig, images: list[str], folder: Path, options: ViewOptions) -> None:
-    from kcal.corners.images import expand_images
-
     if len(images) not in ((0, 2) if options.maps else (2,)):
         got = f"got {len(images)}" if images else "or --maps for the maps alone"
         raise InputError(f"a rig needs LEFT and RIGHT: two files, folders or quoted wildcards, {got}")
     names = ("left", "right")
-    sides = {folder / name: expand_images([given]) for name, given in zip(names, images, strict=False)}
+    sides = {folder / name: rooms.expand_images([given]) for name, given in zip(names, images, strict=False)}
     rig_path, matrix_path = folder / "rectified.rig.json", folder / "Q.npy"
     extras = [rig_path, matrix_path, *(path for name in names for path in _extra_paths(folder, name, options))]
 
@@ -296,14 +287,12 @@ def _write_extras(folder: Path, name: str, module: kcal.lens.Undistort, options:
     """Maps (2, H, W) for cv2.remap, (1, H, W, 2) for grid_sample with align_corners=True, and the mask."""
     import torch
 
-    from kcal.io.images import write_png
-
     if options.maps:
         last = torch.tensor(module.camera.size, dtype=torch.float64) - 1.0
         _save_array(folder / f"{name}_map.npy", ((module.grid.double() + 1.0) * 0.5 * last).movedim(-1, 0).float())
         _save_array(folder / f"{name}_grid.npy", module.grid[None].float())
     if options.mask:
-        write_png(folder / f"{name}_mask.png", (module.mask.byte() * 255).numpy())
+        rooms.write_png(folder / f"{name}_mask.png", (module.mask.byte() * 255).numpy())
 
 
 def _save_array(path: Path, values: Any) -> None:
@@ -316,15 +305,13 @@ def _save_array(path: Path, values: Any) -> None:
 
 def _tell_view(camera: kcal.Camera, module: kcal.lens.Undistort, label: str) -> None:
     """Print what the new image shows, what is cut, and what the entrance pupil does."""
-    from kcal.lens.views import pupil_shift, shown_by
-
-    shown = shown_by(camera, module.new_camera, module.rotation, module.mask)
+    shown = rooms.shown_by(camera, module.new_camera, module.rotation, module.mask)
     across, down = shown.degrees
     out.print(
         f"{label}{across:.1f} x {down:.1f} degrees; {100 * shown.valid:.1f} % of pixels valid; shows "
         f"{100 * shown.source:.1f} % of the source, the rest is cut off"
     )
-    shift = pupil_shift(camera, _NEAR)
+    shift = rooms.pupil_shift(camera, _NEAR)
     if shift >= _FELT:
         where = "far away" if math.isinf(module.at) else f"at {module.at:g} m"
         out.print(
@@ -362,14 +349,12 @@ def _tell_ranges(module: kcal.lens.StereoRectification) -> None:
     """Print what a disparity means in the middle of the image."""
     import torch
 
-    from kcal.locate.budget import usual_ranges
-
     focal, _, cx, cy = module.camera.params[:4].tolist()
     width, height = module.camera.size
     where = torch.tensor([[min(max(cx, 0.0), width - 1.0), 0.5 * (height - 1)]], dtype=torch.float64)
     # Distances from the camera, of which the depth is a part.
     ahead = float(torch.hypot(torch.hypot(where[0, 0] - cx, where[0, 1] - cy), torch.tensor(focal))) / focal
-    ranges = usual_ranges(module.rig)
+    ranges = rooms.usual_ranges(module.rig)
     apart = float(module.right_center[:2].sum())
     disparity = focal * apart * ahead / torch.tensor(ranges, dtype=torch.float64)
     found = kcal.locate.DisparityRanges(module, disparity_sigma=_DISPARITY_SIGMA).at(
@@ -411,9 +396,6 @@ def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.NewFil
     import numpy as np
     import torch
 
-    from kcal.lens.camera_like import ray_error
-    from kcal.lens.uncertainty import paraxial_focal
-
     rig = rig_of(sources[0]) if len(sources) == 1 else None
     cameras = [single_camera(source) for source in sources] if rig is None else [rig.left, rig.right]
     viewmats = torch.eye(4, dtype=torch.float64).repeat(len(cameras), 1, 1)
@@ -422,13 +404,13 @@ def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.NewFil
     with steps("rays", 2) as advance:
         module = kcal.lens.CameraRays(cameras)
         advance("rounding")
-        error = max(ray_error(camera, own) for camera, own in zip(cameras, module(), strict=True))
+        error = max(rooms.ray_error(camera, own) for camera, own in zip(cameras, module(), strict=True))
         advance("writing")
     # gsplat counts pixels from the corner of the first one.
     Ks = torch.stack([camera.matrix.detach() for camera in cameras])
     Ks[:, :2, 2] += 0.5
     for matrix, camera in zip(Ks, cameras, strict=True):
-        matrix[[0, 1], [0, 1]] = paraxial_focal(camera).value.detach()
+        matrix[[0, 1], [0, 1]] = rooms.paraxial_focal(camera).value.detach()
     data = io.BytesIO()
     np.savez(
         data,

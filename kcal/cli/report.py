@@ -8,12 +8,12 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import Annotated, NamedTuple
 
 import typer
 
 import kcal
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.console import err, out, print_answer, print_styled, print_wrote, steps, tell, tell_table, warn
 from kcal.cli.inputs import CAMERA_OR_RIG, pixel_sigma_and_source, pixel_sigma_of, single_camera
 from kcal.cli.options import Kind, Several
@@ -23,19 +23,16 @@ from kcal.file_kind import file_kind
 from kcal.files import check_writable, read_bytes, write_atomic
 from kcal.table import Table
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from kcal.calibrate.camera.result import CameraCalibrationResult
-    from kcal.calibrate.camera.trust import IntervalCheck, Refit
-    from kcal.calibrate.rig.result import RigResult
-    from kcal.finding import Finding
-    from kcal.report.verdict import Verdict
-
-# A verdict, how the pictures of its page are drawn, and its tables.
-Judged: TypeAlias = "tuple[Verdict, Callable[[], dict[str, bytes]], list[list[list[str]]]]"
 # The exit code of a no, apart from errors (1) and wrong usage (2).
 NO = 3
+
+
+class Judged(NamedTuple):
+    """A verdict, how the pictures of its page are drawn, and its tables."""
+
+    verdict: rooms.Verdict
+    pictures: Callable[[], dict[str, bytes]]
+    tables: list[list[list[str]]]
 
 
 def report_command(
@@ -77,12 +74,12 @@ def report_command(
         if file_kind(subject) == "rig"
         else _of_camera(subject, given, needs, baseline, pixel_sigma_of(pixel_sigma))
     )
-    tell(verdict=found[0].to_dict())
+    tell(verdict=found.verdict.to_dict())
     if not told_usable(found, output):
         raise typer.Exit(NO)
 
 
-def told_usable(found: Judged, page: Path | None, warned: Iterable[Finding] = ()) -> bool:
+def told_usable(found: Judged, page: Path | None, warned: Iterable[rooms.Finding] = ()) -> bool:
     """Print a verdict and write its page; returns whether it is a yes.
 
     Args:
@@ -90,21 +87,19 @@ def told_usable(found: Judged, page: Path | None, warned: Iterable[Finding] = ()
         page: to write.
         warned: findings of which the command has warned already.
     """
-    from kcal.report.pages import range_rows, save_verdict_page
-
-    verdict, pictures, tables = found
+    verdict = found.verdict
     for line in verdict.lines(warned):
         style = {"  met:": "green", "  miss": "red"}.get(line[:6], "bold")
         print_styled(line, r"^(YES|NO\b|  met(?=:)|  missed(?=:))", style)
     if page is not None:
-        ranges = [range_rows(verdict)] if verdict.answers else []
+        ranges = [rooms.range_rows(verdict)] if verdict.answers else []
         with steps("drawing", None):
-            drawn = pictures()
-        print_wrote(save_verdict_page(page, verdict, drawn, [*ranges, *tables]))
+            drawn = found.pictures()
+        print_wrote(rooms.save_verdict_page(page, verdict, drawn, [*ranges, *found.tables]))
     return verdict.usable
 
 
-def warned_of(result: RigResult) -> list[Finding]:
+def warned_of(result: rooms.RigResult) -> list[rooms.Finding]:
     """Findings of which was warned when a rig was solved, and when its cameras were calibrated."""
     known = [camera.calibration.record for camera in result.data.cameras if camera.calibration]
     return [*result.findings, *(finding for record in known if record for finding in record.findings)]
@@ -113,14 +108,11 @@ def warned_of(result: RigResult) -> list[Finding]:
 def _of_camera(
     path: Path, observations: list[Path], needs: tuple[kcal.report.Requirement, ...], baseline: float, mark_sigma: float
 ) -> Judged:
-    from kcal.report.judge_camera import stored_verdict
-    from kcal.report.pages import camera_tables
-
     camera = single_camera(str(path))
     name = (camera.calibration.name if camera.calibration else "") or path.name.split(".")[0]
     if not observations:
-        found = stored_verdict(camera, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name)
-        return found, dict, camera_tables(camera)
+        found = rooms.stored_verdict(camera, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name)
+        return Judged(found, dict, rooms.camera_tables(camera))
     if len(observations) > 1:
         raise InputError("a camera has one observations file; give --observations once")
     result, made = calibrated_again(camera, observations[0], f"calibrating {name}")
@@ -128,7 +120,7 @@ def _of_camera(
 
 
 def judged(
-    result: CameraCalibrationResult,
+    result: rooms.CameraCalibrationResult,
     options: kcal.CalibrationOptions,
     needs: tuple[kcal.report.Requirement, ...],
     *,
@@ -138,25 +130,21 @@ def judged(
     stored: kcal.Camera | None = None,
 ) -> Judged:
     """The verdict on a calibration, with the pictures and tables of its page; `stored` as in `camera_verdict`."""
-    from kcal.report.pages import camera_tables
-    from kcal.report.verdict_pictures import camera_pictures
-
     with steps(f"checking {name}", None) as advance:
         examination = kcal.calibrate.examine(result, options, advance)
     verdict = kcal.report.camera_verdict(
         result, options, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name, examination=examination,
         stored=stored,
     )  # fmt: skip
-    return verdict, lambda: camera_pictures(result, examination), camera_tables(result.camera, result, name)
+    tables = rooms.camera_tables(result.camera, result, name)
+    return Judged(verdict, lambda: rooms.camera_pictures(result, examination), tables)
 
 
 def calibrated_again(
     camera: kcal.Camera, observations: Path, what: str
-) -> tuple[CameraCalibrationResult, kcal.CalibrationOptions]:
+) -> tuple[rooms.CameraCalibrationResult, kcal.CalibrationOptions]:
     """A camera of a file, calibrated once more from its views: files have no residuals and no poses."""
-    from kcal.calibrate.camera.trust import stored_options
-
-    seen, options = kcal.Observations.load(observations), stored_options(camera)
+    seen, options = kcal.Observations.load(observations), rooms.stored_options(camera)
     check_views_of([camera], [seen], [observations])
     with steps(what, None) as advance:
         return kcal.calibrate_camera(seen, options, advance), options
@@ -165,10 +153,8 @@ def calibrated_again(
 def _of_rig(
     path: Path, observations: list[Path], needs: tuple[kcal.report.Requirement, ...], pixel_sigma: float | None
 ) -> Judged:
-    from kcal.report.judge_rig import named_cameras
-
     rig = kcal.load_rig(path)
-    cameras = named_cameras(rig)
+    cameras = rooms.named_cameras(rig)
     if rig.is_pair and rig.names == ("left", "right"):
         if observations and len(observations) != 2:
             raise InputError("a rig needs --observations LEFT RIGHT")
@@ -183,16 +169,12 @@ def _of_rig(
 
 def judged_rig(
     rig: kcal.Rig, observations: Sequence[Path], needs: tuple[kcal.report.Requirement, ...], *, mark_sigma: float,
-    name: str, cameras: Sequence[tuple[str, kcal.Camera]], result: RigResult | None = None,
+    name: str, cameras: Sequence[tuple[str, kcal.Camera]], result: rooms.RigResult | None = None,
 ) -> Judged:  # fmt: skip
     """The verdict on a rig and, with the observations of `cameras`, each with its name, on these as well.
 
     Of a rig that was just solved, `result` has its warnings, its pairs of boards, and what is drawn of it.
     """
-    from kcal.report.judge_rig import named_cameras
-    from kcal.report.pages import camera_tables
-    from kcal.report.verdict_pictures import rig_pictures
-
     found = []
     with steps("cameras", len(observations)) as advance:
         for (side, camera), file in zip(cameras, observations, strict=False):
@@ -206,21 +188,21 @@ def judged_rig(
         pairs, unpaired = _pairs(rig, observations)
     verdict = kcal.report.rig_verdict(
         rig, needs, mark_sigma=mark_sigma, result=result, pairs=pairs, unpaired=unpaired,
-        cameras=[one[0] for one in found], subject=name,
+        cameras=[one.verdict for one in found], subject=name,
     )  # fmt: skip
 
     def drawn() -> dict[str, bytes]:
         """With those of the cameras, named as findings of a rig name them."""
         own = {f"{one.subject}-{picture}": data for one, make, _ in found for picture, data in make().items()}
-        return own if result is None else rig_pictures(result) | own
+        return own if result is None else rooms.rig_pictures(result) | own
 
     # Tables of cameras that were not calibrated again are as the rig's file has them.
-    again_made = [] if result is not None else [table for one in found for table in one[2]]
-    stored = (table for side, camera in named_cameras(rig) for table in camera_tables(camera, name=side))
-    return verdict, drawn, again_made or [*stored]
+    again_made = [] if result is not None else [table for one in found for table in one.tables]
+    stored = (table for side, camera in rooms.named_cameras(rig) for table in rooms.camera_tables(camera, name=side))
+    return Judged(verdict, drawn, again_made or [*stored])
 
 
-def _pairs(rig: kcal.Rig, observations: Sequence[Path]) -> tuple[tuple[Tensor, Tensor] | None, str]:
+def _pairs(rig: kcal.Rig, observations: Sequence[Path]) -> tuple[tuple[rooms.Tensor, rooms.Tensor] | None, str]:
     """Corners of the board and pixels of pairs of views, or why there are none."""
     left, right = (kcal.Observations.load(file) for file in observations)
     try:
@@ -304,24 +286,20 @@ def check_command(
     name = camera.name.removesuffix(".json").removesuffix(".camera")
     kept = check_writable(output or camera.with_name(f"{name}.check.npz"), camera)
 
-    from kcal.calibrate.camera.trust import FEWEST, interval_check
-
     at = distance or [math.inf]
     result, options, fingerprint = _calibration_of(camera, observations)
     done, whole = _all_refits(result, options, at, refits, fingerprint, kept)
-    if len(done) < FEWEST:
+    if len(done) < rooms.FEWEST:
         err.print(f"interrupted after {len(done)} of {refits} refits: too few to tell; {kept} has them", markup=False)
         raise typer.Exit(_INTERRUPTED)
-    found = interval_check(result, at, done)
+    found = rooms.interval_check(result, at, done)
     fine = _told_refits(found, len(done))
     if whole:
         fine = _told_views(result, options) and fine
         if against is not None:
             fine = _told_against(result, against, options, at) and fine
     if picture is not None:
-        from kcal.report.calibration import interval_figure
-
-        print_wrote(kcal.report.save_picture(picture, interval_figure(found, result.observations, camera.name)))
+        print_wrote(kcal.report.save_picture(picture, rooms.interval_figure(found, result.observations, camera.name)))
     print_wrote(kept)
     if not whole:
         err.print(f"interrupted after {len(done)} of {refits} refits; the same command continues", markup=False)
@@ -332,12 +310,9 @@ def check_command(
 
 def _check_ranges(path: Path, ranges: Path, marks: Path | None, sigma: float | None) -> None:
     """Print known and measured ranges, and whether they agree."""
-    from kcal.io.rig_file import load_pair
-    from kcal.locate.budget import check_ranges, read_known_ranges
-
-    rig, points = load_pair(path), read_known_ranges(ranges, marks)
+    rig, points = rooms.load_pair(path), rooms.read_known_ranges(ranges, marks)
     noise, note = pixel_sigma_and_source(sigma, rig)
-    found = check_ranges(rig, points.marks, points.ranges, points.sigmas, pixel_sigma=noise)
+    found = kcal.locate.check_ranges(rig, points.marks, points.ranges, points.sigmas, pixel_sigma=noise)
     columns = {
         "name": "point", "known_m": "known m", "sigma_m": "±", "measured_m": "measured m", "low_m": "low",
         "high_m": "high", "pull": "error / σ",
@@ -361,10 +336,8 @@ def _check_ranges(path: Path, ranges: Path, marks: Path | None, sigma: float | N
 
 def _calibration_of(
     path: Path, observations: Path | None
-) -> tuple[CameraCalibrationResult, kcal.CalibrationOptions, str]:
+) -> tuple[rooms.CameraCalibrationResult, kcal.CalibrationOptions, str]:
     """The calibration, with residuals and poses, which a camera file does not have; and the file's fingerprint."""
-    from kcal.report.judge_camera import other_views
-
     camera = kcal.load_camera(path)
     if camera.calibration is None or camera.calibration.known(camera.params.detach()) is None:
         raise InputError(
@@ -377,25 +350,23 @@ def _calibration_of(
         wanted = f" ({name})" if name else ""
         raise InputError(f"{path}: its observations{wanted} are not beside it; name them with --observations")
     result, options = calibrated_again(camera, file, "calibrating")
-    others, _ = other_views(camera, result)
+    others, _ = rooms.other_views(camera, result)
     if others:
         raise InputError(f"{file}: {others[0].sentence}")
     return result, options, camera.fingerprint
 
 
 def _all_refits(
-    result: CameraCalibrationResult,
+    result: rooms.CameraCalibrationResult,
     options: kcal.CalibrationOptions,
     ranges: list[float],
     count: int,
     fingerprint: str,
     path: Path,
-) -> tuple[list[Refit], bool]:
+) -> tuple[list[rooms.Refit], bool]:
     """So many refits, those of an earlier run included; and whether these are all."""
-    from kcal.calibrate.camera.trust import GRID, simulated_refits
-
     # That of the file: a calibration that is made again differs in the last digits.
-    text = repr((fingerprint, [view.pixels for view in result.observations.views], ranges, GRID))
+    text = repr((fingerprint, [view.pixels for view in result.observations.views], ranges, rooms.GRID))
     key = hashlib.sha256(f"{kcal.__version__}{text}".encode()).hexdigest()[:16]
     done = _kept_refits(path, key)[:count]
     if done:
@@ -406,7 +377,7 @@ def _all_refits(
     try:
         with steps("refits", count) as advance:
             advance("", len(done))
-            for refit in simulated_refits(result, options, ranges, todo):
+            for refit in rooms.simulated_refits(result, options, ranges, todo):
                 done.append(refit)
                 advance(f"{len(done)} of {count}")
                 if time.monotonic() - saved > _OFTEN:
@@ -419,7 +390,7 @@ def _all_refits(
     return done, whole
 
 
-def _keep_refits(path: Path, key: str, refits: list[Refit]) -> None:
+def _keep_refits(path: Path, key: str, refits: list[rooms.Refit]) -> None:
     import numpy as np
 
     data = io.BytesIO()
@@ -428,16 +399,13 @@ def _keep_refits(path: Path, key: str, refits: list[Refit]) -> None:
     write_atomic(path, data.getvalue())
 
 
-def _kept_refits(path: Path, key: str) -> list[Refit]:
+def _kept_refits(path: Path, key: str) -> list[rooms.Refit]:
     """The refits of an earlier run; none where the file is of another camera, other ranges or another version."""
     import torch
 
-    from kcal.calibrate.camera.trust import Refit
-    from kcal.strict_formats import read_npz
-
     if not path.exists():
         return []
-    arrays = read_npz(read_bytes(path, _LARGEST_RUN), str(path), _LARGEST_RUN, "run of kcal check")
+    arrays = rooms.read_npz(read_bytes(path, _LARGEST_RUN), str(path), _LARGEST_RUN, "run of kcal check")
     if str(arrays.get("kcal")) != "check":
         raise FileError(f"{path}: not a file of kcal check; choose another name with -o")
     if str(arrays.get("key")) != key:
@@ -447,15 +415,13 @@ def _kept_refits(path: Path, key: str) -> list[Refit]:
         parts = zip(
             arrays["seed"].tolist(), *(torch.from_numpy(arrays[name]) for name in ("errors", "own")), strict=True
         )
-        return [Refit(seed, errors, own) for seed, errors, own in parts]
+        return [rooms.Refit(seed, errors, own) for seed, errors, own in parts]
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"{path}: damaged; remove it and start again") from error
 
 
-def _told_refits(found: IntervalCheck, count: int) -> bool:
+def _told_refits(found: rooms.IntervalCheck, count: int) -> bool:
     """Print the answer."""
-    from kcal.report.calibration import range_label
-
     columns = {
         "range_m": "range", "share": "refits inside, %", "share_error": "±", "lowest_share": "lowest place, %",
         "error_px": "error px, RMS", "stated_px": "stated px, RMS", "factor": "σ should be",
@@ -465,7 +431,7 @@ def _told_refits(found: IntervalCheck, count: int) -> bool:
     for at, (share, error), places, (seen, told), factor in parts:
         lowest = float(places[places.isfinite()].min())
         rows.append([
-            (at, range_label(at)), (share, f"{100 * share:.1f}"), (error, f"{100 * error:.1f}"),
+            (at, rooms.range_label(at)), (share, f"{100 * share:.1f}"), (error, f"{100 * error:.1f}"),
             (lowest, f"{100 * lowest:.0f}"), (seen, f"{seen:.3g}"), (told, f"{told:.3g}"),
             (factor, f"x {factor:.2f}"),
         ])  # fmt: skip
@@ -473,7 +439,7 @@ def _told_refits(found: IntervalCheck, count: int) -> bool:
     if found.failed:
         warn(f"{found.failed} of {count} simulated captures could not be calibrated; they are not counted")
     worst = min(range(len(rows)), key=lambda i: found.shares[i][0])
-    share, where = 100 * found.shares[worst][0], range_label(found.ranges[worst])
+    share, where = 100 * found.shares[worst][0], rooms.range_label(found.ranges[worst])
     if found.true:
         text = f"the stated 95 % intervals are true: they contain {share:.0f} % of {count} refits, {where}"
     else:
@@ -486,12 +452,10 @@ def _told_refits(found: IntervalCheck, count: int) -> bool:
     return found.true
 
 
-def _told_views(result: CameraCalibrationResult, options: kcal.CalibrationOptions) -> bool:
+def _told_views(result: rooms.CameraCalibrationResult, options: kcal.CalibrationOptions) -> bool:
     """Print whether the capture's own views contradict the intervals: by their halves, and by the default lens."""
-    from kcal.report.judge_camera import fault_of_views
-
     with steps("examining the views", None) as advance:
-        fault = fault_of_views(result, options, advance)
+        fault = rooms.fault_of_views(result, options, advance)
     if fault is None:
         print_answer(True, "its own views say nothing against lens model and board")
     else:
@@ -501,16 +465,13 @@ def _told_views(result: CameraCalibrationResult, options: kcal.CalibrationOption
 
 
 def _told_against(
-    result: CameraCalibrationResult, path: Path, options: kcal.CalibrationOptions, ranges: list[float]
+    result: rooms.CameraCalibrationResult, path: Path, options: kcal.CalibrationOptions, ranges: list[float]
 ) -> bool:
     """Print whether a second capture gives the same camera."""
-    from kcal.calibrate.camera.trust import against_capture
-    from kcal.report.calibration import range_label
-
     second = kcal.Observations.load(path)
     check_views_of([result.camera], [second], [path])
     with steps(f"calibrating {path.name}", None):
-        found = against_capture(result, second, options, ranges)
+        found = rooms.against_capture(result, second, options, ranges)
     columns = {
         "range_m": "range", "seen_px": "seen px, RMS", "predicted_px": "predicted px, RMS",
         "ratio": "seen / predicted", "probability": "probability",
@@ -519,7 +480,7 @@ def _told_against(
     for at, one in zip(ranges, found, strict=True):
         ratio, chance = one.ratio or math.nan, one.probability if one.probability is not None else math.nan
         rows.append([
-            (at, range_label(at)), (one.rms, f"{one.rms:.3g}"), (one.rms / ratio, f"{one.rms / ratio:.3g}"),
+            (at, rooms.range_label(at)), (one.rms, f"{one.rms:.3g}"), (one.rms / ratio, f"{one.rms / ratio:.3g}"),
             (ratio, f"{ratio:.2f}"), (chance, f"{chance:.2g}"),
         ])  # fmt: skip
     tell_table("against", Table(columns, rows))

@@ -9,13 +9,13 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
 import kcal
 import kcal.cli.rig_sources as rig_sources
-from kcal.cli import console, kinds
+from kcal.cli import console, kinds, rooms
 from kcal.cli.console import aligned, err, out, print_label, print_styled, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_and_source, pixel_sigma_of
 from kcal.cli.options import Command, Kind, Only, Rare, Several, declared, group_with_default
@@ -26,18 +26,13 @@ from kcal.files import check_writable, write_atomic
 from kcal.texts import length_text, measured_length, measured_text, number_text
 from kcal.values import WithSigma
 
-if TYPE_CHECKING:
-    from kcal.calibrate.rig.result import RigResult
-    from kcal.watch.turned import Drift
-
-
 # What `kcal rig` prints of a solved rig.
 
 # Items of a source that are named when they are left out; of thousands of matches more are no news.
 _MOST_NAMED = 12
 
 
-def source_lines(result: RigResult) -> list[str]:
+def source_lines(result: rooms.RigResult) -> list[str]:
     """Residuals by source."""
     rows = [["source", "used", "left out", "RMS px", "RMS", "sigmas"]]
     for source in result.sources:
@@ -50,10 +45,8 @@ def source_lines(result: RigResult) -> list[str]:
     return aligned(rows)
 
 
-def rig_lines(result: RigResult, rig: kcal.Rig, unpaired: int) -> list[str]:
+def rig_lines(result: rooms.RigResult, rig: kcal.Rig, unpaired: int) -> list[str]:
     """What a result says: residuals by source, the relative pose with its sigmas, the board's squares, the mounting."""
-    from kcal.report.judge_rig import triangulated_sides
-
     lines = source_lines(result)
     boards, mounting = result.data.boards, rig.mounting
     lines += [
@@ -66,7 +59,7 @@ def rig_lines(result: RigResult, rig: kcal.Rig, unpaired: int) -> list[str]:
         lines.append(f"{len(result.pairs)} of {len(boards.names)} pairs used, {unpaired} views without partner")
         if result.pairs:
             board = boards.board
-            side, spread = triangulated_sides(rig, board.columns, board.rows, result.pixels, board.points)
+            side, spread = rooms.triangulated_sides(rig, board.columns, board.rows, result.pixels, board.points)
             true = float((board.points[1] - board.points[0]).norm())
             what = {"checkerboard": "squares", "aprilgrid": "tags"}.get(board.pattern, "distances of circles")
             lines.append(
@@ -90,7 +83,7 @@ def rig_lines(result: RigResult, rig: kcal.Rig, unpaired: int) -> list[str]:
     return lines
 
 
-def _exact_line(result: RigResult, rig: kcal.Rig) -> str:
+def _exact_line(result: rooms.RigResult, rig: kcal.Rig) -> str:
     """Which cameras were taken as exact, what an error of their lenses does, and which files had no error bars."""
     far, share = 100.0 * float(rig.baseline), 10.0 / float(rig.left.focal.mean())
     text = (
@@ -105,7 +98,7 @@ def _exact_line(result: RigResult, rig: kcal.Rig) -> str:
     return f"{text}. Without error bars came {' and '.join(bare)}: calibrate with kcal, or import a file that has them"
 
 
-def print_rig(result: RigResult, lines: list[str]) -> None:
+def print_rig(result: rooms.RigResult, lines: list[str]) -> None:
     """Print the lines of a result, and what was turned, left out and should be doubted."""
     for line in lines:
         print_styled(line, r"(?<=^RMS )\S+ px|(?<=^baseline ).+")
@@ -163,8 +156,6 @@ def solve_and_write(
 
     The rig is written; it is printed how each camera stands, and whether the rig may be used.
     """
-    from kcal.locate.survey import solve_surveyed
-
     two = len(paths) == 2
     names = camera_names(paths, told_apart=not two)
     if not two and sources.match:
@@ -177,7 +168,7 @@ def solve_and_write(
     with console.ending_with(functools.partial(_cure_of_sources, paths, sources)):
         read = rig_sources.read_sources(cameras, sources, names)
         with steps("solving the rig" if two else "solving the stations", None) as advance:
-            result = solve_surveyed(read.data, read.origin, options, advance)
+            result = rooms.solve_surveyed(read.data, read.origin, options, advance)
     if not two:
         rig = result.stations(read.origin)
     else:
@@ -209,25 +200,20 @@ def solve_and_write(
             )
     print_wrote(output, picture)
     if needs or report is not None:
-        from kcal.report.judge_rig import named_cameras
-
         pairs = sources.pairs or ()
         found = judged_rig(
             rig, pairs if two and _calibrated_from(rig, pairs) else (), needs, mark_sigma=noise,
-            name=output.name.split(".")[0], cameras=named_cameras(rig), result=result,
+            name=output.name.split(".")[0], cameras=rooms.named_cameras(rig), result=result,
         )  # fmt: skip
-        tell(verdict=found[0].to_dict())
+        tell(verdict=found.verdict.to_dict())
         if not told_usable(found, report, warned_of(result)):
             raise typer.Exit(NO)
 
 
 def _print_ranges(rig: kcal.Rig, noise: float, note: str) -> None:
     """Print what the errors of ranges consist of."""
-    from kcal.locate.budget import range_sigmas
-    from kcal.report.tables import range_sigma_rows
-
     try:
-        print_table(range_sigma_rows(range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
+        print_table(rooms.range_sigma_rows(rooms.range_sigmas(rig, pixel_sigma=noise), rig.covariance is not None))
         if note:
             out.print(note)
     except InputError as error:
@@ -245,9 +231,7 @@ def _calibrated_from(rig: kcal.Rig, pairs: Sequence[Path]) -> bool:
 
 def print_stands(rig: kcal.Rig) -> None:
     """Print how each camera stands, with error bars: on the Earth, or in the rig's own frame."""
-    from kcal.report.shown import stands
-
-    rows, told = stands(rig)
+    rows, told = rooms.stands(rig)
     print_table(rows)
     tell(cameras=told)
 
@@ -362,13 +346,12 @@ def place_command(
     needed = (stands.site, stands.heading, stands.pitch)
     if (places is None) == any(value is None for value in needed) or (places and (stands.roll or any(needed))):
         raise typer.BadParameter("give --site, --heading and --pitch of each camera, or all of them in --places")
-    from kcal.locate.stations import read_stands
 
     names = camera_names(cameras)
     if places is None:
         poses = dict(zip(names, stands.mountings(len(names)), strict=True))
     else:
-        poses = read_stands(places, None if len(names) == 1 else names)
+        poses = rooms.read_stands(places, None if len(names) == 1 else names)
     lenses = rig_sources.load_cameras(cameras * len(poses) if len(cameras) == 1 else cameras)
     rig = kcal.rig.station_rig(dict(zip(poses, lenses, strict=True)), [*poses.values()])
     kcal.save_rig(rig, output)
@@ -504,19 +487,18 @@ def check(
         landmarks: Surveyed places among the marks, as for `kcal rig`.
         relock: Rig file to write if it has turned; an old one of that name is kept.
     """
-    from kcal.io.rig_file import load_pair
-    from kcal.watch.turned import seen_again
-
     if reference is None and landmarks is None:
         raise InputError("give --reference (marks of the same points in old images) or --landmarks (a survey)")
     if reference is not None and landmarks is not None:
         raise InputError("give --reference or --landmarks, not both: with old marks no survey is needed")
     if relock is not None:
         check_writable(relock, marks, *filter(None, (reference, landmarks)))
-    old = load_pair(rig)
+    old = rooms.load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, old)
     now = kcal.locate.read_marks(marks, single=True)
-    features = None if reference is None else seen_again(kcal.locate.read_marks(reference, single=True), now, noise)
+    features = (
+        None if reference is None else rooms.seen_again(kcal.locate.read_marks(reference, single=True), now, noise)
+    )
     surveyed = None if landmarks is None else _landmarks(old, landmarks, now, noise)
     drift = kcal.rig.check_rig(old, features=features, landmarks=surveyed)
     print_turns(drift, f"{sum(item.used for item in drift.items)} of {len(drift.items)}")
@@ -542,14 +524,12 @@ def check(
 
 
 def _landmarks(rig: kcal.Rig, path: Path, now: kcal.locate.Marks, sigma: float) -> kcal.Landmarks:
-    from kcal.locate.survey import read_survey
-
     if rig.mounting is None:
         raise InputError("the rig file does not say where the rig stands; solve it with landmarks, or use --reference")
-    return kcal.rig.match_landmarks(read_survey(path, rig.mounting.origin), now, now.sigmas(sigma)).landmarks
+    return kcal.rig.match_landmarks(rooms.read_survey(path, rig.mounting.origin), now, now.sigmas(sigma)).landmarks
 
 
-def print_turns(drift: Drift, used: str = "") -> None:
+def print_turns(drift: rooms.Drift, used: str = "") -> None:
     """Print what has turned by how much, and of how many points that was found, if that is known."""
     rows = [["turn of", "pitch °", "yaw °", "roll °", *(["used"] if used else [])]]
     for name, turn, covariance in drift.turns:
@@ -559,7 +539,7 @@ def print_turns(drift: Drift, used: str = "") -> None:
     print_table(rows, left=range(len(rows[0])))
 
 
-def _print_effect(drift: Drift) -> None:
+def _print_effect(drift: rooms.Drift) -> None:
     for distance, found, sigma in zip(*(value.tolist() for value in drift.effect()), strict=True):
         shift = "infinity" if math.isinf(found) else f"{found:.1f} m ({found - distance:+z.1f} ± {sigma:.1f} m)"
         out.print(f"with the old rig a target at {distance:g} m is found at {shift}")

@@ -8,10 +8,10 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import kcal
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.console import aligned, steps, warn
 from kcal.cli.inputs import pixel_sigma_and_source, typed_with
 from kcal.cli.options import Kind, Rare, Several
@@ -19,13 +19,6 @@ from kcal.cli.stars import Night
 from kcal.errors import InputError, KcalError
 from kcal.texts import measured_text
 from kcal.values import WithSigma, named, with_sigma
-
-if TYPE_CHECKING:
-    from kcal.calibrate.rig.result import RigResult
-    from kcal.lens.calibration import CalibrationRecord
-    from kcal.skyline.attitude import SkylineAttitude
-    from kcal.stars.night import NamedStars
-
 
 # What `kcal rig` and `kcal station` solve from, as options.
 
@@ -129,8 +122,6 @@ def _add_tracks(read: RigReading, files: tuple[Path, Path]) -> None:
     Raises:
         InputError: tables in another kind of frame; nothing to match.
     """
-    from kcal.locate.moving import CLOCK
-
     given, names = read.given, list(read.cameras)
     tracks, frame = kcal.rig.read_tracks(files[0], read.origin)
     if (read.positions or read.placed) and frame != read.origin:
@@ -156,10 +147,10 @@ def _add_tracks(read: RigReading, files: tuple[Path, Path]) -> None:
         listed = ", ".join(f"{one.label} ({names[one.camera]})" for one in unknown)
         read.notes.append(f"follow no track, or it is not clear which: {listed}")
 
-    def clock(result: RigResult) -> list[str]:
-        if CLOCK not in (amounts := result.effects()):
+    def clock(result: rooms.RigResult) -> list[str]:
+        if rooms.CLOCK not in (amounts := result.effects()):
             return []
-        offset, sigma = (options.clock_sigma * value for value in amounts[CLOCK])
+        offset, sigma = (options.clock_sigma * value for value in amounts[rooms.CLOCK])
         return [f"the tracks' clock is {measured_text(found.clock + offset, sigma)} s ahead of the cameras'"]
 
     read.origin = frame
@@ -176,10 +167,6 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     Raises:
         InputError: nothing tells a length, or images without partners or with too little in common.
     """
-    from kcal.calibrate.rig.pairs import image_pairs
-    from kcal.corners.images import expand_images, read_gray
-    from kcal.scene.match import match_scene, scene_of
-
     first, second = read.cameras.values()
     # One position alone tells no length; GNSS of both does.
     if not any((*map(read.sources.get, ("boards", "landmarks")), read.given.baseline, len(read.positions) > 1)):
@@ -188,13 +175,13 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
             "the images the same. Add --baseline, --landmarks, --positions or boards (--pairs)"
         )
     given = [*images_by_camera("--scene", words, list(read.cameras)).values()]
-    chosen = image_pairs(*given)
+    chosen = rooms.image_pairs(*given)
     pairs, found, refused = [], [], list[str]()
     with steps("matching the scene", len(chosen)) as advance:
         for left, right in chosen:
-            pair = kcal.rig.ImagePair(left.name, read_gray(left), read_gray(right))
+            pair = kcal.rig.ImagePair(left.name, rooms.read_gray(left), rooms.read_gray(right))
             try:
-                found.append(match_scene((first, second), pair))
+                found.append(rooms.match_scene((first, second), pair))
                 pairs.append(pair)
             except InputError as error:
                 refused.append(str(error))
@@ -202,14 +189,14 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     if not pairs:
         raise InputError(f"--scene: {refused[0]}")
     warn(*(f"{text}; left out" for text in refused))
-    features, counts = scene_of((first, second), pairs, found)
+    features, counts = rooms.scene_of((first, second), pairs, found)
     rows: list[tuple[str, ...]] = [("scene", "matched", "no texture", "off the line", "moved", "thinned", "used")]
     rows += [
         (one.name, *map(str, (one.matched, one.untextured, one.off_line, one.moved, one.thinned, one.used)))
         for one in counts
     ]
     read.notes += aligned(rows)
-    if alone := sum(len(expand_images(one)) for one in given) - 2 * len(chosen):
+    if alone := sum(len(rooms.expand_images(one)) for one in given) - 2 * len(chosen):
         read.notes.append(f"{alone} images of the scene without partner")
     if len(pairs) == 1:
         read.notes.append("one pair: what moves cannot be told from what stands still; give pairs of several times")
@@ -230,12 +217,10 @@ def _add_stars(read: RigReading, words: Sequence[str]) -> None:
     """
     import torch
 
-    from kcal.stars.rig_stars import moments_of
-
     night, cameras, positions = read.given, read.cameras, read.positions
     given = images_by_camera("--stars", words, tuple(cameras))
     images = [_named_images(name, given[name], read) if name in given else [] for name in cameras]
-    moments, alone = moments_of(images)
+    moments, alone = rooms.moments_of(images)
     on_earth = all(image.on_earth for own in images for image in own)
     if not any(len(moment) > 1 for moment in moments) and not (on_earth and len(cameras) > 2):
         first, *_, last = cameras
@@ -303,12 +288,9 @@ def images_by_camera(option: str, words: Sequence[str], names: Sequence[str]) ->
     raise InputError(f"{option}: give a folder or a quoted wildcard for each camera, {places}; or NAME=IMAGES for each")
 
 
-def _named_images(side: str, given: list[str], read: RigReading) -> list[NamedStars]:
-    from kcal.stars.detect import expand_nights, read_night
-    from kcal.stars.night import clock_doubts
-
-    files, night = expand_nights(given), read.given
-    found: list[NamedStars] = []
+def _named_images(side: str, given: list[str], read: RigReading) -> list[rooms.NamedStars]:
+    files, night = rooms.expand_nights(given), read.given
+    found: list[rooms.NamedStars] = []
     taken = Night(
         time=night.time, dut1=night.dut1, temperature=night.temperature, pressure=night.pressure,
         # A place without a time tells nothing.
@@ -318,14 +300,14 @@ def _named_images(side: str, given: list[str], read: RigReading) -> list[NamedSt
         for path in files:
             view = taken.view(path)
             try:
-                image = kcal.stars.name_stars(read_night(path), read.cameras[side], view)
+                image = kcal.stars.name_stars(rooms.read_night(path), read.cameras[side], view)
             except KcalError as error:
                 warn(f"{side} {path.name}: {error}; left out")
             else:
                 warn(*(f"{side} {path.name}: {text}" for text in image.warnings))
                 found.append(image)
             advance(path.name)
-    warn(*(f"{side}, image {number + 1} with names: {text}" for number, text in clock_doubts(found)))
+    warn(*(f"{side}, image {number + 1} with names: {text}" for number, text in rooms.clock_doubts(found)))
     if not found:
         raise InputError(f"--stars: in none of the {len(files)} images of {side} stars have names")
     return found
@@ -342,16 +324,14 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
     """
     import torch
 
-    from kcal.corners.images import expand_images, read_gray
-
     given, names = read.given, list(read.cameras)
     words = given.skyline or given.scene
     if not words:
         raise InputError("--terrain needs images of the skyline: --skyline IMAGES, or NAME=IMAGES for each camera")
     images = [
-        kcal.rig.SkylineImage(name=f"{name} {path.name}", camera=names.index(name), image=read_gray(path))
+        kcal.rig.SkylineImage(name=f"{name} {path.name}", camera=names.index(name), image=rooms.read_gray(path))
         for name, own in images_by_camera("--skyline", words, names).items()
-        for path in expand_images(own)
+        for path in rooms.expand_images(own)
     ]
     places = {position.camera: position for position in read.positions}
     without = sorted({names[image.camera] for image in images if image.camera not in places})
@@ -375,17 +355,15 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
             centers, sigma, error=error,
         )  # fmt: skip
     if given.skyline_picture is not None:
-        from kcal.report.rig import skyline_figure
-
         kcal.report.save_picture(
-            given.skyline_picture, skyline_figure([(image.name, image.image) for image in images], found)
+            given.skyline_picture, rooms.skyline_figure([(image.name, image.image) for image in images], found)
         )
     read.notes += [line for image, one in zip(images, found, strict=True) for line in _lines(image, names, one)]
     warn(*(f"skyline {image.name}: {text}" for image, one in zip(images, found, strict=True) for text in one.warnings))
     read.add("skyline", source)
 
 
-def _lines(image: kcal.rig.SkylineImage, names: Sequence[str], found: SkylineAttitude) -> list[str]:
+def _lines(image: kcal.rig.SkylineImage, names: Sequence[str], found: rooms.SkylineAttitude) -> list[str]:
     heading, pitch, roll = found.sigma_deg.tolist()
     shares = ", ".join(f"{name} {100 * share[0]:.0f} %" for name, share in found.shares.items() if share[0] > 0.005)
     second = "" if math.isnan(found.second_deg) else (
@@ -430,7 +408,7 @@ def check_views_of(cameras: Sequence[kcal.Camera], seen: Sequence[kcal.Observati
     sizes, views_sizes = [camera.size for camera in cameras], [views.image_size for views in seen]
     records = [camera.calibration.record if camera.calibration else None for camera in cameras]
 
-    def crossed(fits: Callable[[CalibrationRecord, int], bool]) -> bool:
+    def crossed(fits: Callable[[rooms.CalibrationRecord, int], bool]) -> bool:
         """Whether each camera was calibrated from what the other was given, and neither from its own."""
         known = [[record is not None and fits(record, i) for i in range(len(paths))] for record in records]
         return known == [[False, True], [True, False]]
@@ -490,7 +468,7 @@ class RigReading:
     origin: kcal.Origin | None
     sources: dict[str, Any] = dataclasses.field(default_factory=dict)
     notes: list[str] = dataclasses.field(default_factory=list)
-    tellers: list[Callable[[RigResult], list[str]]] = dataclasses.field(default_factory=list)
+    tellers: list[Callable[[rooms.RigResult], list[str]]] = dataclasses.field(default_factory=list)
     unpaired: int = 0
     pixel_sigma: float | None = None
 
@@ -524,7 +502,7 @@ class RigReading:
         """Everything in one frame."""
         return kcal.RigData(cameras=tuple(self.cameras.values()), names=tuple(self.cameras), **self.sources)
 
-    def told(self, result: RigResult) -> list[str]:
+    def told(self, result: rooms.RigResult) -> list[str]:
         """What there is to say once the rig is solved."""
         return [*self.one_camera, *self.notes, *(line for tell in self.tellers for line in tell(result))]
 
@@ -557,12 +535,10 @@ def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[kcal.Bas
 
 def _add_positions(read: RigReading, path: Path) -> None:
     """Places of the cameras."""
-    from kcal.locate.survey import camera_positions
-
     given = read.given
     placed = kcal.rig.import_survey(path, read.origin, sigma=given.survey_sigma, geoid=given.geoid)
     read.origin = placed.origin
-    read.add("positions", camera_positions(placed, tuple(read.cameras)))
+    read.add("positions", rooms.camera_positions(placed, tuple(read.cameras)))
 
 
 def _add_landmarks(read: RigReading, path: Path) -> None:
@@ -589,13 +565,11 @@ def _add_features(read: RigReading, path: Path) -> None:
 
 def _add_pairs(read: RigReading, files: Sequence[Path]) -> None:
     """Boards that two cameras saw, or any of more."""
-    from kcal.calibrate.rig.pairs import boards_of_several, read_pairs
-
     if len(read.cameras) != 2:
         own = {
             c: kcal.Observations.load(path) for c, path in zip(cameras_of_files(files, read.names), files, strict=True)
         }
-        read.add("boards", boards_of_several(list(read.cameras.values()), read.names, own))
+        read.add("boards", rooms.boards_of_several(list(read.cameras.values()), read.names, own))
         return
     if len(files) != 2:
         raise InputError("--pairs: two files are needed, of the left and of the right camera")
@@ -604,7 +578,7 @@ def _add_pairs(read: RigReading, files: Sequence[Path]) -> None:
     seen = kcal.Observations.load(files[0]), kcal.Observations.load(files[1])
     check_views_of((first, second), seen, files)
     views = seen[0].names, seen[1].names
-    matched = kcal.rig.pair_by_name(*views) if match is None else read_pairs(match, *views)
+    matched = kcal.rig.pair_by_name(*views) if match is None else rooms.read_pairs(match, *views)
     read.add("boards", kcal.rig.paired_boards((first, second), seen, matched))
     read.unpaired = len(views[0]) + len(views[1]) - 2 * len(matched)
 

@@ -12,13 +12,13 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import pydantic
 
 import kcal
 import kcal.report.shown as shown
-from kcal.cli import inputs, kinds
+from kcal.cli import inputs, kinds, rooms
 from kcal.cli.console import err, out, print_table, print_wrote
 from kcal.cli.inputs import pixel_sigma_and_source
 from kcal.cli.locate import LocateOptions, counts_text, pair_localizer, refuse_of_pairs
@@ -29,10 +29,6 @@ from kcal.file_kind import file_kind
 from kcal.files import read_bytes
 from kcal.native_file import digest
 from kcal.strict_json import MOST_BYTES, read_json
-
-if TYPE_CHECKING:
-    from kcal.locate.positions import Located
-    from kcal.locate.survey import Survey
 
 _Summary = TypeVar("_Summary", bound=pydantic.BaseModel)
 
@@ -78,9 +74,7 @@ def _print(blocks: Iterable[str | list[list[str]]]) -> None:
 
 
 def _show_foreign(file: Path) -> None:
-    from kcal.io.formats import recognized
-
-    if recognized(file) == "kcal":
+    if rooms.recognized(file) == "kcal":
         kind = file_kind(file)
         raise FileError(f"{file}: kcal show knows camera, rig and observations files, not {kind} files")
     found = kcal.lens.import_cameras(file)
@@ -94,7 +88,6 @@ def _show_foreign(file: Path) -> None:
 
 def _as_written(content: dict[str, Any]) -> tuple[list[shown.ShownCamera], shown.ShownRig | None] | None:
     """Blocks of a file with their summaries; None where it has none, or was changed after they were written."""
-    from kcal.io.file_summary import CameraSummary, RigSummary
 
     def checked(kind: type[_Summary], summary: Any) -> _Summary:
         return kind.model_validate_json(json.dumps(summary), strict=True)
@@ -102,10 +95,10 @@ def _as_written(content: dict[str, Any]) -> tuple[list[shown.ShownCamera], shown
     try:
         rig, blocks, summaries = None, [content], [content["summary"]]
         if content["kcal"] == "rig":
-            rig = content, checked(RigSummary, content["summary"])
+            rig = content, checked(rooms.RigSummary, content["summary"])
             # The rig knows more of its cameras than each of them knew before it was solved.
             blocks, summaries = content["cameras"], content["summary"]["cameras"]
-        cameras = [(block, checked(CameraSummary, known)) for block, known in zip(blocks, summaries, strict=True)]
+        cameras = [(block, checked(rooms.CameraSummary, known)) for block, known in zip(blocks, summaries, strict=True)]
         own = {key: value for key, value in content.items() if key != "cameras"}
         fresh = (rig is None or rig[1].of == digest(own)) and all(
             known.of == digest(block) and (known.board is None) == (block["calibration"] is None)
@@ -157,8 +150,6 @@ def view_command(
         open_: Open it in the viewer, which then sends no statistics.
         reach: How far rays and images are drawn; as far as the farthest thing that is shown if not given.
     """
-    from kcal.report.view import view_image
-
     solved = _rig_of(rig)
     noise, note = pixel_sigma_and_source(options.pixel_sigma, solved)
     pair = len(solved) == 2 and solved.in_first_frame and solved.root is None
@@ -169,7 +160,7 @@ def view_command(
     for file in files or []:
         kind = file_kind(file)
         if kind == "image":
-            scene.append(view_image(file))
+            scene.append(rooms.view_image(file))
         elif kind == "observations":
             scene.append(kcal.Observations.load(file))
         else:
@@ -195,37 +186,29 @@ def _rig_of(source: str) -> kcal.Rig:
     return kcal.Rig([camera], [name or path.name.split(".")[0]], torch.eye(3)[None], torch.zeros(1, 3))
 
 
-def _of_table(file: Path, kind: str, localize: kcal.Localizer, note: str) -> Located | Survey:
+def _of_table(file: Path, kind: str, localize: kcal.Localizer, note: str) -> rooms.Located | kcal.rig.Survey:
     """Positions as they were written, marks or a detector's lines as they are located now, or landmarks."""
     import torch
 
-    from kcal.locate.export import read_positions
-    from kcal.locate.marks import Marks, is_long, read_mark_chunks
-    from kcal.locate.points import PointLocator
-    from kcal.locate.positions import STATUS_NAMES
-    from kcal.locate.survey import read_survey
-    from kcal.locate.tables import PositionColumns, header_of
-    from kcal.pipeline.grouping import marks_of_lines
-
-    locate = PointLocator(localize)
+    locate = rooms.PointLocator(localize)
     lines = kind in ("foreign", "json")
-    if not lines and "status" in header_of(file):
-        located = read_positions(file, locate)
+    if not lines and "status" in rooms.header_of(file):
+        located = rooms.read_positions(file, locate)
     elif kind == "survey":
-        return read_survey(file, localize.origin, measured=False)
+        return rooms.read_survey(file, localize.origin, measured=False)
     else:
         names, single = localize.rig.names, localize.weights == "all"
         if lines:
-            chunks: Iterable[Marks] = [marks_of_lines(file, localize)]
+            chunks: Iterable[kcal.locate.Marks] = [rooms.marks_of_lines(file, localize)]
         else:
-            single = single or is_long(file)
-            chunks = (marks for marks, _ in read_mark_chunks(file, names, single=single))
-        locate = PointLocator(localize.weighing_all()) if single else locate
+            single = single or rooms.is_long(file)
+            chunks = (marks for marks, _ in rooms.read_mark_chunks(file, names, single=single))
+        locate = rooms.PointLocator(localize.weighing_all()) if single else locate
         parts, feet = zip(*map(locate, chunks), strict=True)
-        located = locate.located(PositionColumns.joined(parts), torch.cat(feet) if single else None)
+        located = locate.located(rooms.PositionColumns.joined(parts), torch.cat(feet) if single else None)
         if note:
             err.print(note)
     codes = located.columns.status.tolist()
-    counts = {name: codes.count(code) for code, name in STATUS_NAMES.items() if code in codes}
+    counts = {name: codes.count(code) for code, name in rooms.STATUS_NAMES.items() if code in codes}
     out.print(f"{file}: {counts_text(len(codes), counts)}")
     return located

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import kcal
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_of
 from kcal.cli.options import Kind
@@ -17,9 +17,6 @@ from kcal.files import write_atomic
 from kcal.table import Table
 from kcal.texts import length_text, range_text
 from kcal.values import WithSigma
-
-if TYPE_CHECKING:
-    from kcal.locate.siting import Area, RankedSite, SitingMap
 
 
 def sites_command(
@@ -65,9 +62,6 @@ def sites_command(
         output: CSV file to write: the map, one line for each point.
         picture: The map.
     """
-    from kcal.locate.siting import read_sites, sites_of, siting_map
-    from kcal.locate.stations import stations_of
-
     if (terrain is None) == (ground is None):
         raise InputError("give --terrain, or --ground with the height of level ground above the ellipsoid; one of them")
     surface = (
@@ -76,21 +70,21 @@ def sites_command(
         else kcal.locate.terrain(terrain or "", geoid)
     )
     if file_kind(towers) == "rig":
-        rig = stations_of(kcal.load_rig(towers))
-        standing = sites_of(rig, pixel_sigma_of(pixel_sigma, rig))
+        rig = rooms.stations_of(kcal.load_rig(towers))
+        standing = rooms.sites_of(rig, pixel_sigma_of(pixel_sigma, rig))
         if rig.root is None:
             warn(f"{towers}: the rig has no error bars: bearings count as exact but for the noise of marks")
     else:
-        standing = read_sites(towers, surface)
-    proposed = [] if candidates is None else read_sites(candidates, surface)
+        standing = rooms.read_sites(towers, surface)
+    proposed = [] if candidates is None else rooms.read_sites(candidates, surface)
     names = [site.name for site in (*standing, *proposed)]
     if twice := {name for name in names if names.count(name) > 1}:
         raise InputError(f"{candidates}: {min(twice)!r} is a tower and a candidate; names must differ")
     with steps("looking from each site", None):
         field = kcal.locate.area_of(list(area), surface, (*standing, *proposed), cells=cells, above=above)
-        now = siting_map(field, standing)
+        now = rooms.siting_map(field, standing)
         ranked = kcal.locate.rank_sites(field, standing, proposed, build=build)
-        later = siting_map(field, [*standing, *(one.site for one in ranked if one.order)]) if ranked else None
+        later = rooms.siting_map(field, [*standing, *(one.site for one in ranked if one.order)]) if ranked else None
     if unknown := 1.0 - float(field.known.double().mean()):
         warn(f"the terrain has no heights in {100 * unknown:.1f} % of the area, which is left out")
     if bool(field.surface.up.isnan().any()):
@@ -109,14 +103,11 @@ def sites_command(
     if output is not None:
         write_atomic(output, _map_text(field, now, later))
     if picture is not None:
-        from kcal.report.positions import siting_figure
-
-        kcal.report.save_picture(picture, siting_figure(field, standing, ranked))
+        kcal.report.save_picture(picture, rooms.siting_figure(field, standing, ranked))
     print_wrote(output, picture)
 
 
-def _print_towers(now: SitingMap) -> None:
-
+def _print_towers(now: rooms.SitingMap) -> None:
     two = now.seen_by > 1
     some = length_text(float(now.sigma[two].median()), digits=2) if bool(two.any()) else "nowhere known"
     one = float((now.seen_by == 1).double().mean())
@@ -127,7 +118,7 @@ def _print_towers(now: SitingMap) -> None:
     )
 
 
-def _ranked_table(ranked: list[RankedSite]) -> Table:
+def _ranked_table(ranked: list[rooms.RankedSite]) -> Table:
     columns = {
         "name": "candidate", "order": "build", "heading_deg": "heading °", "mean_sigma_m": "alone",
         "covered": "covered", "mean_sigma_after_m": "after",
@@ -144,7 +135,7 @@ def _ranked_table(ranked: list[RankedSite]) -> Table:
     return Table(columns, rows)
 
 
-def _map_text(area: Area, now: SitingMap, later: SitingMap | None) -> str:
+def _map_text(area: rooms.Area, now: rooms.SitingMap, later: rooms.SitingMap | None) -> str:
     """One line for each point whose ground is known."""
     import torch
 
@@ -214,18 +205,14 @@ def budget_command(
     """
     import math
 
-    from kcal.io.rig_file import load_pair
-    from kcal.locate.budget import range_sigmas, usual_ranges
-    from kcal.report.tables import range_sigma_rows
-
-    chosen = kcal.rig.planned_rig(focal_px=focal, baseline_m=baseline.value) if rig is None else load_pair(rig)
+    chosen = kcal.rig.planned_rig(focal_px=focal, baseline_m=baseline.value) if rig is None else rooms.load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, None if rig is None else chosen)
     disparity = math.sqrt(2.0) * noise
     error = 0.001 if baseline.sigma is None else baseline.sigma
     errors = kcal.locate.BudgetErrors(
         disparity_px=disparity, yaw_deg=yaw_sigma, baseline_m=error, timing_s=timing, speed_mps=speed
     )
-    far = list(distances or usual_ranges(chosen, _BASELINES))
+    far = list(distances or rooms.usual_ranges(chosen, _BASELINES))
     labels = {
         "disparity": f"disparity {disparity:.3g} px",
         "yaw": f"relative yaw {yaw_sigma:g}°",
@@ -245,12 +232,12 @@ def budget_command(
     print_table(rows, left=(1,))
     if chosen.covariance is not None:
         out.print(f"\nWhat the rig file knows, and {noise:g} px of noise in each mark:")
-        print_table(range_sigma_rows(range_sigmas(chosen, far, pixel_sigma=noise)))
+        print_table(rooms.range_sigma_rows(rooms.range_sigmas(chosen, far, pixel_sigma=noise)))
     if aperture is not None:
         print_star_budget(chosen, aperture, pitch, clock_sigma)
     if picture is not None:
-        from kcal.report.positions import budget_figure, plotted_ranges
-
-        sweep = plotted_ranges(far)
-        kcal.report.save_picture(picture, budget_figure(sweep, kcal.locate.range_errors(chosen, sweep, errors), labels))
+        sweep = rooms.plotted_ranges(far)
+        kcal.report.save_picture(
+            picture, rooms.budget_figure(sweep, kcal.locate.range_errors(chosen, sweep, errors), labels)
+        )
     print_wrote(picture)

@@ -5,22 +5,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import kcal
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.console import out, print_styled, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import single_camera
 from kcal.cli.options import Kind
 from kcal.errors import InputError, KcalError
 from kcal.files import check_writable
-
-if TYPE_CHECKING:
-    from kcal.calibrate.camera.result import CameraCalibrationResult
-    from kcal.stars.detect import DetectedStars
-    from kcal.stars.lens import StarCamera
-    from kcal.stars.night import NamedStars
-
 
 # Night images as commands read them: when and where they were taken, and the lens that their stars tell.
 
@@ -46,27 +39,23 @@ class Night:
 
     def view(self, path: Path) -> kcal.stars.SkyView:
         """Of one image."""
-        from kcal.stars.detect import time_of
-
         known = {} if self.temperature is None else {"celsius": self.temperature, "celsius_sigma": 1.0}
         known |= {} if self.pressure is None else {"hectopascal": self.pressure, "hectopascal_sigma": 1.0}
         air = None if self.site is None else kcal.stars.Air.at_height(self.site.height, **known)
-        time = time_of(self.time, path)
+        time = rooms.time_of(self.time, path)
         return kcal.stars.SkyView(time=time, origin=self.site, air=air, dut1=self.dut1, time_sigma=self.time_sigma)
 
 
 def camera_by_stars(
-    files: list[Path], views: list[kcal.stars.SkyView], what: str, boards: CameraCalibrationResult | None = None
-) -> tuple[StarCamera, tuple[int, int]]:
+    files: list[Path], views: list[kcal.stars.SkyView], what: str, boards: rooms.CameraCalibrationResult | None = None
+) -> tuple[rooms.StarCamera, tuple[int, int]]:
     """The camera of night images, and of what boards said of it before; and the images' size."""
-    from kcal.stars.detect import read_night
-
-    stars: list[DetectedStars] = []
+    stars: list[rooms.DetectedStars] = []
     sizes = set()
     with steps("finding stars", len(files)) as advance:
         for path in files:
             try:
-                image = read_night(path)
+                image = rooms.read_night(path)
                 stars.append(kcal.stars.detect_stars(image))
             except KcalError as error:
                 raise InputError(f"{path.name}: {error}") from error
@@ -97,8 +86,6 @@ def print_star_budget(rig: kcal.Rig, aperture: float, altitude: float, clock: fl
         altitude: of the middle of the image, degrees.
         clock: sigma of the offset between the cameras' clocks, seconds.
     """
-    from kcal.stars.detect import NightPlan, planned_stars
-
     focal, size = float(rig.left.params[0]), rig.left.size
     out.print(
         f"stars: f {focal:g} px, {size[0]}x{size[1]}, aperture {aperture:g} mm, middle of the image {altitude:g}° up, "
@@ -109,11 +96,11 @@ def print_star_budget(rig: kcal.Rig, aperture: float, altitude: float, clock: fl
     told = []
     for sky, magnitude in _SKIES.items():
         for seconds in _EXPOSURES:
-            plan = NightPlan(
+            plan = rooms.NightPlan(
                 focal_px=focal, size=size, aperture_mm=aperture, seconds=seconds, sky_magnitude=magnitude,
                 altitude_deg=altitude,
             )  # fmt: skip
-            found = planned_stars(plan)
+            found = rooms.planned_stars(plan)
             shares = [found.range_share(_DISTANCE, float(rig.baseline), pairs, clock) for pairs in (1, _PAIRS)]
             some = math.isfinite(found.yaw_sigma)
             rows.append([
@@ -159,8 +146,8 @@ def by_night(images: list[str] | None, time: str | None, site: kcal.Origin | Non
 
 
 def joined_by_stars(
-    boards: CameraCalibrationResult, images: list[str], time: str | None, site: kcal.Origin | None, output: Path
-) -> CameraCalibrationResult:
+    boards: rooms.CameraCalibrationResult, images: list[str], time: str | None, site: kcal.Origin | None, output: Path
+) -> rooms.CameraCalibrationResult:
     """The calibration by boards, refined by stars. Other arguments as of `by_night`."""
     found = _by_stars(images, time, site, output, boards)
     agreement, joint = found.agreement, found.joint
@@ -179,14 +166,12 @@ def _by_stars(
     time: str | None,
     site: kcal.Origin | None,
     output: Path,
-    boards: CameraCalibrationResult | None = None,
-) -> StarCamera:
+    boards: rooms.CameraCalibrationResult | None = None,
+) -> rooms.StarCamera:
     """Read the images, calibrate, and tell what was found."""
-    from kcal.stars.detect import expand_nights
-
     if site is not None and time is None:
         raise InputError("--site without --time tells nothing: refraction depends on both")
-    files = expand_nights(images)
+    files = rooms.expand_nights(images)
     check_writable(output, *files)
     views = [Night(time=time, site=site).view(path) for path in files]
     found, size = camera_by_stars(files, views, "calibrating by stars", boards)
@@ -214,7 +199,7 @@ def _by_stars(
     return found
 
 
-def sparse_parts(found: StarCamera, size: tuple[int, int]) -> list[str]:
+def sparse_parts(found: rooms.StarCamera, size: tuple[int, int]) -> list[str]:
     """Which parts of the image saw too few stars, and what to do."""
     import numpy as np
 
@@ -260,22 +245,19 @@ def stars_command(
         camera: Camera file; FILE:left names one of a rig. Without one, the lens is found from the stars first.
         picture: the first image that has names, with them.
     """
-    from kcal.stars.detect import expand_nights, read_night
-    from kcal.stars.night import clock_doubts
-
-    files = expand_nights(images)
+    files = rooms.expand_nights(images)
     if picture is not None:
         check_writable(picture, *files)
     views = [night.view(path) for path in files]
     catalog = kcal.stars.StarCatalog.bundled()
     lens = single_camera(camera) if camera else camera_by_stars(files, views, "finding the lens")[0].lens.camera
     told: list[dict[str, Any]] = []
-    seen: list[tuple[str, NamedStars]] = []
+    seen: list[tuple[str, rooms.NamedStars]] = []
     rows = [["image", "stars", "named", "RMS px", *_heads(views[0])]]
     with steps("naming stars", len(files)) as advance:
         for path, view in zip(files, views, strict=True):
             try:
-                image = read_night(path)
+                image = rooms.read_night(path)
                 found = kcal.stars.name_stars(image, lens, view, catalog)
             except KcalError as error:
                 if len(files) == 1:
@@ -290,7 +272,7 @@ def stars_command(
                 rows.append(_row(path, found))
                 warn(*(f"{path.name}: {text}" for text in found.warnings))
             advance(path.name)
-    for number, text in clock_doubts([found for _, found in seen]):
+    for number, text in rooms.clock_doubts([found for _, found in seen]):
         warn(f"{seen[number][0]}: {text}")
         next(image for image in told if image["image"] == seen[number][0])["warnings"].append(text)
     tell(images=told)
@@ -308,7 +290,7 @@ def _heads(view: kcal.stars.SkyView) -> list[str]:
     return ["right ascension", "declination", "± x", "± y", "± z", "left out"]
 
 
-def _row(path: Path, found: NamedStars) -> list[str]:
+def _row(path: Path, found: rooms.NamedStars) -> list[str]:
     angles = found.heading_pitch_roll or found.right_ascension_declination or ()
     cells = [f"{angle:.4f}°" for angle in angles] + [f"{sigma:.4f}°" for sigma in found.sigma_deg]
     if found.view.on_earth and not found.on_earth:
@@ -318,7 +300,7 @@ def _row(path: Path, found: NamedStars) -> list[str]:
     return [path.name, f"{len(found.detected.pixels)}", f"{stars.count}", f"{stars.rms_px:.3f}", *cells, left_out]
 
 
-def _told(path: Path, found: NamedStars) -> dict[str, Any]:
+def _told(path: Path, found: rooms.NamedStars) -> dict[str, Any]:
     names = ("heading_deg", "pitch_deg", "roll_deg") if found.on_earth else ("right_ascension_deg", "declination_deg")
     angles = found.heading_pitch_roll or found.right_ascension_declination or ()
     return {
@@ -336,9 +318,9 @@ def _told(path: Path, found: NamedStars) -> dict[str, Any]:
     }
 
 
-def _draw(picture: Path, image: Any, found: NamedStars, catalog: kcal.stars.StarCatalog, title: str) -> None:
-    from kcal.report.rig import stars_figure
-
+def _draw(picture: Path, image: Any, found: rooms.NamedStars, catalog: kcal.stars.StarCatalog, title: str) -> None:
     star = found.attitude.star.tolist()
     names = [catalog.name_of(int(catalog.number[i])) if i >= 0 else "" for i in star]
-    kcal.report.save_picture(picture, stars_figure(image, found.detected.pixels, names, found.attitude.residual, title))
+    kcal.report.save_picture(
+        picture, rooms.stars_figure(image, found.detected.pixels, names, found.attitude.residual, title)
+    )

@@ -6,24 +6,19 @@ import math
 import time as clocks
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 import kcal
 from kcal.bag import bag_and_topic
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.console import err, on_signals, out, print_wrote, steps, warn
 from kcal.cli.options import Kind
 from kcal.cli.rig import DRIFTED, print_turns, replace_rig
 from kcal.errors import InputError, with_extra
 from kcal.files import check_writable
 from kcal.texts import measured_text
-
-if TYPE_CHECKING:
-    from kcal.corners.images import Gray
-    from kcal.pipeline.video_source import FramesTogether
-    from kcal.watch.watcher import Noticed, Watcher, Webhook
 
 _EXIT = "exit"
 # Points of a picture.
@@ -79,12 +74,6 @@ def watch_command(
         parquet: The history as a Parquet file, too: written whole once a day and at the end, for tools of tables.
         picture: The attitude over time and its 95 % intervals, at the end.
     """
-    from kcal.corners.images import read_gray
-    from kcal.io.rig_file import load_pair
-    from kcal.watch.history import Temperatures, save_history
-    from kcal.watch.watcher import Watcher, Webhook
-    from kcal.watch.watcher import relock as relocked_by
-
     if images and len(images) != 2:
         raise typer.BadParameter("two folders, videos or addresses, of the left and the right camera, are needed")
     if output.suffix.lower() != ".csv":
@@ -96,18 +85,18 @@ def watch_command(
             pass
     if relock is not None:
         check_writable(relock, output)
-    hooks = [Webhook(address) for address in alarm or [] if address != _EXIT]
-    known = load_pair(rig)
+    hooks = [rooms.Webhook(address) for address in alarm or [] if address != _EXIT]
+    known = rooms.load_pair(rig)
     raised = 0
     if images:
-        air = None if temperatures is None else Temperatures(temperatures)
-        watcher = Watcher(
+        air = None if temperatures is None else rooms.Temperatures(temperatures)
+        watcher = rooms.Watcher(
             known, output, every_s=every, limit_deg=limit, temperatures=air, parquet=parquet,
             tell=lambda text: err.print(text),
         )  # fmt: skip
         try:
             if reference_images is not None and watcher.looks == 0 and watcher.last_time == -math.inf:
-                watcher.refer_to(*(read_gray(path) for path in reference_images))
+                watcher.refer_to(*(rooms.read_gray(path) for path in reference_images))
             if watcher.offset:
                 err.print(f"continuing after {watcher.last_time:.3f} s of {output}")
             _follow(watcher, known, (images[0], images[1]), hooks, ends=_EXIT in (alarm or []))
@@ -118,14 +107,14 @@ def watch_command(
         if not watcher.last_time > -math.inf:
             raise InputError("no pair of images was looked at")
     if parquet is not None:
-        print_wrote(save_history(output, parquet))
+        print_wrote(rooms.save_history(output, parquet))
     with steps("fitting how it turns", None):
         watched = kcal.rig.Watched.read(output, known)
     _tell_turns(watched, limit)
     if picture is not None:
         _draw_turns(watched, picture, limit, output.name)
     if relock is not None:
-        better = relocked_by(watched)
+        better = rooms.relock(watched)
         out.print(("re-locked: " if better.rig else "not re-locked: ") + better.reason)
         if better.rig is not None:
             replace_rig(relock, better.rig)
@@ -133,15 +122,17 @@ def watch_command(
         raise typer.Exit(DRIFTED)
 
 
-def _follow(watcher: Watcher, rig: kcal.Rig, sources: tuple[str, str], hooks: list[Webhook], *, ends: bool) -> None:
+def _follow(
+    watcher: rooms.Watcher, rig: kcal.Rig, sources: tuple[str, str], hooks: list[rooms.Webhook], *, ends: bool
+) -> None:
     """Look until the sources end, it is stopped, or an alarm ends it."""
     frames, stopped = None, False
     if not Path(sources[0]).is_dir() or bag_and_topic(sources[0]) is not None:
         with with_extra("video", "videos need"):
-            from kcal.pipeline.video_source import FramesTogether
+            pass
 
         sizes = {"left": rig.left.size, "right": rig.right.size}
-        frames = FramesTogether(sources, sizes, pairs=True, tell=lambda text: err.print(text))
+        frames = rooms.FramesTogether(sources, sizes, pairs=True, tell=lambda text: err.print(text))
 
     def stop(*_: object) -> None:
         nonlocal stopped
@@ -168,7 +159,7 @@ def _follow(watcher: Watcher, rig: kcal.Rig, sources: tuple[str, str], hooks: li
             frames.close()
 
 
-def _of_frames(watcher: Watcher, frames: FramesTogether) -> Iterator[tuple[float, Gray, Gray]]:
+def _of_frames(watcher: rooms.Watcher, frames: rooms.FramesTogether) -> Iterator[tuple[float, rooms.Gray, rooms.Gray]]:
     with steps("watching", None) as advance:
         for _, (_, group) in frames(0 if frames.live else watcher.offset):
             one, other = group
@@ -177,20 +168,18 @@ def _of_frames(watcher: Watcher, frames: FramesTogether) -> Iterator[tuple[float
                 yield one.time, one.gray().numpy(), other.gray().numpy()
 
 
-def _folder_pairs(watcher: Watcher, folders: tuple[str, str]) -> Iterator[tuple[float, Gray, Gray]]:
-    from kcal.calibrate.rig.pairs import image_pairs
-    from kcal.corners.images import image_time, read_gray
-
-    timed = sorted((image_time(left), left, right) for left, right in image_pairs(*([folder] for folder in folders)))
+def _folder_pairs(watcher: rooms.Watcher, folders: tuple[str, str]) -> Iterator[tuple[float, rooms.Gray, rooms.Gray]]:
+    timed = sorted(
+        (rooms.image_time(left), left, right) for left, right in rooms.image_pairs(*([folder] for folder in folders))
+    )
     with steps("watching", len(timed)) as advance:
         for time, left, right in timed:
             if watcher.due(time):
-                yield time, read_gray(left), read_gray(right)
+                yield time, rooms.read_gray(left), rooms.read_gray(right)
             advance(left.name)
 
 
-def _turn_text(noticed: Noticed) -> str:
-
+def _turn_text(noticed: rooms.Noticed) -> str:
     angles = zip(("pitch", "yaw", "roll"), noticed.turn.tolist(), noticed.sigma.tolist(), strict=True)
     return ", ".join(
         f"{name} {measured_text(math.degrees(turn), math.degrees(sigma), '°', sign=True)}"
@@ -198,7 +187,7 @@ def _turn_text(noticed: Noticed) -> str:
     )
 
 
-def _message(noticed: Noticed, watcher: Watcher) -> dict[str, object]:
+def _message(noticed: rooms.Noticed, watcher: rooms.Watcher) -> dict[str, object]:
     degrees = [[math.degrees(value) for value in values.tolist()] for values in (noticed.turn, noticed.sigma)]
     return {
         "kcal": "watch alarm", "rig": watcher.rig.fingerprint, "time": noticed.row.time,
@@ -206,7 +195,7 @@ def _message(noticed: Noticed, watcher: Watcher) -> dict[str, object]:
     }  # fmt: skip
 
 
-def _summary(watcher: Watcher, hooks: list[Webhook]) -> str:
+def _summary(watcher: rooms.Watcher, hooks: list[rooms.Webhook]) -> str:
     parts = [f"{watcher.looks:,} measurements, {watcher.alarms:,} alarms"]
     if watcher.skipped:
         parts.append(f"{watcher.skipped:,} images not after the last measurement, left out")
@@ -234,8 +223,6 @@ def _tell_turns(watched: kcal.rig.Watched, limit: float) -> None:
 def _draw_turns(watched: kcal.rig.Watched, picture: Path, limit: float, title: str) -> None:
     import numpy as np
 
-    from kcal.report.rig import attitude_figure
-
     step = -(-len(watched.times) // _DRAWN)
     times = watched.times[::step]
     drifts = []
@@ -246,4 +233,6 @@ def _draw_turns(watched: kcal.rig.Watched, picture: Path, limit: float, title: s
     angle = np.degrees(np.stack([drift.relative.numpy() for drift in drifts]))
     sigma = np.degrees(np.stack([drift.relative_covariance.diagonal().sqrt().numpy() for drift in drifts]))
     seen = np.array(watched.seen[::step], bool)
-    print_wrote(kcal.report.save_picture(picture, attitude_figure(np.array(times), angle, sigma, seen, limit, title)))
+    print_wrote(
+        kcal.report.save_picture(picture, rooms.attitude_figure(np.array(times), angle, sigma, seen, limit, title))
+    )

@@ -417,7 +417,7 @@ for name in {}:
         ("export plain.json -o plain.yaml", "cv2 torch"),
         (f"report {SAMPLE}", "torch"),
         (f"locate {SAMPLE} {SAMPLE.with_name('sample-points.csv')}", "pyproj torch"),
-        ("budget", "kornia pyproj torch"),
+        ("budget", "kornia torch"),
     ],
 )
 def test_a_command_loads_what_it_computes_with_and_no_more(line: str, libraries: str, start_folder: Path) -> None:
