@@ -29,7 +29,7 @@ from kcal.io.rig_file import RigFile, load_pair
 from kcal.locate.marks import write_marks
 from kcal.locate.positions import interval_coverage
 from kcal.locate.survey import LOCAL, places_csv
-from kcal.report.pages import Part, save_summary
+from kcal.report.pages import save_summary
 from kcal.report.tables import chance_text, diagonal_rows, truth_rows
 from kcal.sim.scene import DemoScene, NamedPoints, mark_points, render_demo
 from kcal.texts import length_text
@@ -39,95 +39,30 @@ REQUIREMENT = "5km:10%"
 SIDES = ("left", "right")
 
 
-def _save_summary(
-    output: Path, title: str, lead: str, came_out: Part, caption: str, cameras: Part, rig: Part, command: str
-) -> None:
-    """Write `summary.html`: parts of its own, the map with a caption, and the command that locates again."""
-    where = (
-        "Seen from above, north up; ranges are on a logarithmic scale. map.html beside this page can be moved and "
-        "zoomed."
-    )
-    again = (
-        "Print a board (kcal board), photograph it (kcal capture helps), and go on as the tutorial shows. This "
-        "locates the points again, from the files in this folder:"
-    )
-    seen = Part(heading="The map", text=(where,), pictures=((output / "map.png", caption),))
-    yourself = Part(heading="3. Do it yourself", text=(again,), code=command)
-    save_summary(output / "summary.html", title, lead, [came_out, seen, cameras, rig, yourself])
-
-
 def _save_site_summary(output: Path, scene: DemoScene, table: list[list[str]], chance: str, command: str) -> None:
     """That of the simulated site, with true and estimated positions and how many intervals contain the truth."""
-    found = sum(len(kcal.Observations.load(output / f"{side}.obs.json").views) for side in SIDES)
     file = RigFile.load(output / "rig.json")
     rig, needs = file.rig(), kcal.report.Requirement.parse(REQUIREMENT)
     (answer,) = kcal.report.rig_verdict(rig, needs, mark_sigma=scene.mark_sigma).answers
     calibration = math.hypot(answer.parts["lenses"], answer.parts["relative pose"])
-    came_out = Part(
-        heading="What came out",
-        text=(
-            f"May this rig be used? {'Yes' if answer.ok else 'No'}: {answer.text}. Noise in the marks makes "
-            f"±{length_text(answer.parts['marks'], digits=2)} of it, lenses and relative pose "
-            f"±{length_text(calibration, digits=2)}.",
-            f'{chance} "Across" is the error across the line of sight. The last column is the error that is left '
-            "when the marks have no noise: the share of the calibration.",
-        ),
-        table=tuple(map(tuple, table)),
-    )
-    cameras = Part(
-        heading="1. Each camera was calibrated",
-        text=(
-            f"A printed board was photographed {scene.near_views} times by each camera, and found in {found} of "
-            f"{2 * scene.near_views} pictures. The board is bent by 1 mm and stretched by 0.15 %; kcal measures "
-            f"that on the way. {_residuals_text(file)} The truth is a lens traced ray by ray through seven "
-            "pieces of glass that are not quite centered.",
-        ),
-        pictures=(
-            (output / "images" / "left-near" / "near-02.png", "One of the pictures"),
-            (output / "left.png", "Left camera: where corners were, and their residuals"),
-        ),
-    )
-    solved = Part(
-        heading="2. The rig was solved",
-        text=(
-            f"{len(scene.landmarks.names)} landmarks, surveyed to {100 * scene.survey_sigma:g} cm and marked in "
-            f"both images, tell where the cameras stand and look. Baseline: "
-            f"{length_text(float(rig.baseline), digits=5)} (true {length_text(float(scene.rig.baseline), digits=5)}).",
-        ),
-        pictures=((output / "rig.png", "Residuals by source"),),
-    )
-    lead = (
-        "kcal rendered a site whose truth is known, calibrated two cameras from their own pictures of a printed board, "
-        "solved the rig, and located seven targets. Nothing but the pictures and a surveyor's list was used; the truth "
-        "comes in only here, for the comparison."
-    )
-    title, caption = (
-        "Two cameras, seven targets, 100 m to 5 km",
-        "True positions, estimates, and the error of each range",
-    )
-    _save_summary(output, title, lead, came_out, caption, cameras, solved, command)
+    save_summary(
+        output / "summary.html", "demo_site_page", folder=output, scene=scene, table=table, chance=chance,
+        command=command, answer=answer, residuals=_residuals_text(file),
+        found=sum(len(kcal.Observations.load(output / f"{side}.obs.json").views) for side in SIDES),
+        marks=length_text(answer.parts["marks"], digits=2), calibration=length_text(calibration, digits=2),
+        baseline=length_text(float(rig.baseline), digits=5),
+        true_baseline=length_text(float(scene.rig.baseline), digits=5),
+    )  # fmt: skip
 
 
 def _save_pairs_summary(output: Path, table: list[list[str]], command: str) -> None:
     """That of a folder of pairs, with the board's diagonal in each pair, known and located."""
     file = RigFile.load(output / "rig.json")
-    pairs = 0 if file.calibration is None else file.calibration.pairs
-    came_out = Part(
-        heading="What came out",
-        text=(
-            "Two opposite corners of the board were located in each pair. Their distance is known, so the table "
-            "shows how accurate the rig is at the distance of the board.",
-        ),
-        table=tuple(map(tuple, table)),
-    )
-    pictures = [(output / f"{side}.png", f"{side.capitalize()} camera: where corners were, and their residuals")
-                for side in SIDES]  # fmt: skip
-    cameras = Part(heading="1. Each camera was calibrated", text=(_residuals_text(file),), pictures=tuple(pictures))
-    solved = f"From {pairs} pairs: baseline {length_text(float(file.rig().baseline), digits=5)}."
-    rig = Part(heading="2. The rig was solved", text=(solved,))
-    lead = "kcal found the board in your pictures, calibrated both cameras, solved the rig, and located its corners."
-    title, caption = f"Two cameras, {pairs} pairs of pictures", "The located corners, and the interval of each range"
-    _save_summary(output, title, lead, came_out, caption, cameras, rig, command)
+    save_summary(
+        output / "summary.html", "demo_pairs_page", folder=output, table=table, command=command,
+        residuals=_residuals_text(file), pairs=0 if file.calibration is None else file.calibration.pairs,
+        baseline=length_text(float(file.rig().baseline), digits=5),
+    )  # fmt: skip
 
 
 def _residuals_text(file: RigFile) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import dataclasses
 import datetime
 import math
 from collections.abc import Mapping, Sequence
@@ -57,6 +56,7 @@ def verdict_page(
         drawn = {"ranges": range_picture(verdict.answers), **drawn}
     return _from_template(
         "verdict_page",
+        "verdict_page.css",
         verdict=verdict,
         pictures={name: base64.b64encode(data).decode("ascii") for name, data in drawn.items()},
         captions={name: _caption(name) for name in drawn},
@@ -65,7 +65,7 @@ def verdict_page(
     )
 
 
-def _from_template(name: str, **values: Any) -> str:
+def _from_template(name: str, style_file: str, **values: Any) -> str:
     """Fill a template of this folder and embed its style; markup in values is escaped."""
     import jinja2  # loaded here, like matplotlib above: answers without a page do without both
 
@@ -75,7 +75,7 @@ def _from_template(name: str, **values: Any) -> str:
     environment.filters |= {
         "distance": range_text, "found": _found, "percent": _percent, "sentence": _sentence, "embedded": _embedded,
     }  # fmt: skip
-    style = (_HERE / f"{name}.css").read_text(encoding="utf-8")
+    style = (_HERE / style_file).read_text(encoding="utf-8")
     policy = jinja2.filters.Markup(page_policy(styles=[style]))
     return environment.get_template(f"{name}.html").render(style=jinja2.filters.Markup(style), policy=policy, **values)
 
@@ -184,57 +184,19 @@ def _sentence(text: str, stop: str = ".") -> str:
     return text[:1].upper() + text[1:].rstrip(".") + stop
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Part:
-    """A part of the page: a heading, sentences, and what belongs to them.
+def save_summary(path: str | Path, name: str, **values: Any) -> Path:
+    """Write what a demonstration did and what came out, atomically.
 
     Args:
-        heading: its heading.
-        text: its paragraphs.
-        table: rows of cells, the first row with the heads; empty for no table.
-        pictures: PNG or JPEG files with their captions, side by side where there is room.
-        code: a command to copy, or "".
-    """
-
-    heading: str
-    text: tuple[str, ...] = ()
-    table: tuple[tuple[str, ...], ...] = ()
-    pictures: tuple[tuple[str | Path, str], ...] = ()
-    code: str = ""
-
-
-def summary_page(title: str, lead: str, parts: Sequence[Part]) -> str:
-    """Make a page as HTML that explains what was done and what came out.
-
-    Args:
-        title: its title.
-        lead: one paragraph under the title.
-        parts: the parts, in order.
+        path: of the page.
+        name: of the template in this folder.
+        values: that it shows.
 
     Raises:
-        FileError: a picture cannot be read.
-        InputError: a picture that is neither PNG nor JPEG, or a table whose rows differ in length.
-
-    Example:
-        >>> part = Part(heading="Found", table=(("name", "m"), ("gate", "100")))
-        >>> page = summary_page("A rig", "Two cameras.", [part])
-        >>> "<td>gate</td><td>100</td>" in page, "http" in page
-        (True, False)
+        FileError: the file cannot be written, or a picture cannot be read.
+        InputError: a picture that is neither PNG nor JPEG.
     """
-    for part in parts:
-        if len(set(map(len, part.table))) > 1:
-            raise InputError(f"the table of {part.heading!r}: rows of different lengths")
-    return _from_template("summary_page", title=title, lead=lead, parts=parts)
-
-
-def save_summary(path: str | Path, title: str, lead: str, parts: Sequence[Part]) -> Path:
-    """Write the page of `summary_page`, atomically.
-
-    Raises:
-        FileError: the file cannot be written, or see `summary_page`.
-        InputError: see `summary_page`.
-    """
-    return write_atomic(path, summary_page(title, lead, parts))
+    return write_atomic(path, _from_template(name, "summary_page.css", **values))
 
 
 def _embedded(path: str | Path) -> str:

@@ -32,7 +32,7 @@ from kcal.mark.session import Session
 from kcal.pipeline.senders import LiveMap
 from kcal.pipeline.stream import track_columns
 from kcal.report import save_map
-from kcal.report.pages import Part, save_summary
+from kcal.report.pages import save_summary
 from kcal.track import Tracker, TrackOptions
 from kcal.web.serving import LocalServer
 from scripts.shared.marking_scene import LANDMARKS, TARGETS, MarkingSite, marking_site
@@ -158,13 +158,12 @@ def written_map(folder: Path) -> Iterator[Opened]:
 @contextmanager
 def summary(folder: Path) -> Iterator[Opened]:
     """The page of `kcal demo`: a part of every kind."""
-    picture = write_png(folder / "a.png", np.full((400, 600), 128, np.uint8))
+    for name in ("map.png", "left.png", "right.png"):
+        write_png(folder / name, np.full((400, 600), 128, np.uint8))
     table = (("name", *(f"column {i}" for i in range(9))), *((f"row {i}", *("12.3 m",) * 9) for i in range(3)))
-    parts = [
-        Part(heading="Calibration", text=("What was done.",), table=table, pictures=((picture, "Coverage"),)),
-        Part(heading="Again", code="kcal locate rig.json points.csv -o again.geojson --picture map.png " * 3),
-    ]
-    yield save_summary(folder / "s.html", "kcal demo", "A simulated site.", parts).as_uri(), "() => true"
+    command = "kcal locate rig.json points.csv -o again.geojson --picture map.png " * 3
+    values = {"folder": folder, "table": table, "command": command, "pairs": 3, "residuals": "RMS", "baseline": "10 m"}
+    yield save_summary(folder / "s.html", "demo_pairs_page", **values).as_uri(), "() => true"
 
 
 PAGES: dict[str, Callable[[Path], AbstractContextManager[Opened]]] = {
