@@ -37,8 +37,9 @@ from kcal.locate.positions import (
     region_rings,
 )
 from kcal.locate.stereo import PositionStatus
+from kcal.report.pages import from_template
 from kcal.report.tables import interval_text, range_sigma, range_unit
-from kcal.texts import Unit, length_text, number_text, page_data, page_policy, page_text, range_text
+from kcal.texts import Unit, length_text, number_text, range_text
 from kcal.web.coast import coast_near
 
 # Embed a folder of map tiles or a GeoTIFF in a map that works without a network.
@@ -247,33 +248,11 @@ def map_page(
     style += "".join(sheet.read_text(encoding="utf-8") for sheet in (shared / "map.css", own / "map_page.css"))
     sources = (library / "leaflet.js", shared / "map.js", own / "map_page.js")
     scripts = [source.read_text(encoding="utf-8") for source in sources]
-    allowed = "data: https://tile.openstreetmap.org" if online else "data:"
-    title = located.count_note
-    note = (
-        f"From {located.place.lat:.6f}°, {located.place.lon:.6f}°, heading {located.heading_deg:g}° from true north. "
-        f"Regions and intervals: {located.interval_note}. Geoid: {located.geoid or 'none found'}."
-    )
-    key = "White dots: estimated; click one for its numbers. Black outlines: 95 % regions."
-    key += " Red dots: true, with an arrow to the estimate." if truth is not None else ""
-    elements = "\n".join(f"<script>{script}</script>" for script in scripts)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy"
- content="{page_policy(scripts=scripts, styles=(style,), images=allowed)}">
-<title>{page_text(title)}</title>
-<style>{style}</style>
-</head>
-<body>
-<header><h1>{page_text(title)}</h1><p>{page_text(note)}<br>{page_text(key)}</p></header>
-<main id="map" aria-label="Map"></main>
-<script type="application/json" id="data">{page_data(content)}</script>
-{elements}
-</body>
-</html>
-"""
+    return from_template(
+        "map_page", style, scripts, "data: https://tile.openstreetmap.org" if online else "data:",
+        title=located.count_note, place=located.place, heading=located.heading_deg, located=located,
+        with_truth=truth is not None, content=content,
+    )  # fmt: skip
 
 
 def save_map(path: str | Path, located: Located, truth: Tensor | None = None, **options: Any) -> Path:

@@ -15,7 +15,7 @@ from kcal.errors import InputError
 from kcal.files import read_bytes, write_atomic
 from kcal.lens.camera import Camera
 from kcal.report.verdict import RangeAnswer, Verdict
-from kcal.texts import length_text, number_text, page_policy, range_text, visible
+from kcal.texts import length_text, number_text, page_data, page_policy, range_text, visible
 
 _HERE = Path(__file__).parent
 CAPTIONS = {
@@ -54,9 +54,9 @@ def verdict_page(
         from kcal.report.verdict_pictures import range_picture
 
         drawn = {"ranges": range_picture(verdict.answers), **drawn}
-    return _from_template(
+    return from_template(
         "verdict_page",
-        "verdict_page.css",
+        style_of("verdict_page"),
         verdict=verdict,
         pictures={name: base64.b64encode(data).decode("ascii") for name, data in drawn.items()},
         captions={name: _caption(name) for name in drawn},
@@ -65,8 +65,21 @@ def verdict_page(
     )
 
 
-def _from_template(name: str, style_file: str, **values: Any) -> str:
-    """Fill a template of this folder and embed its style; markup in values is escaped."""
+def style_of(name: str) -> str:
+    """The style sheet of a page of this folder."""
+    return (_HERE / f"{name}.css").read_text(encoding="utf-8")
+
+
+def from_template(name: str, style: str, scripts: Sequence[str] = (), images: str = "data:", **values: Any) -> str:
+    """Fill a template of this folder; markup in values is escaped.
+
+    Args:
+        name: of the template.
+        style: embedded in the page.
+        scripts: likewise; others do not run.
+        images: sources of images that the page's policy allows.
+        values: what is filled in.
+    """
     import jinja2  # loaded here, like matplotlib above: answers without a page do without both
 
     environment = jinja2.Environment(
@@ -74,10 +87,14 @@ def _from_template(name: str, style_file: str, **values: Any) -> str:
     )
     environment.filters |= {
         "distance": range_text, "found": _found, "percent": _percent, "sentence": _sentence, "embedded": _embedded,
+        "data": page_data,
     }  # fmt: skip
-    style = (_HERE / style_file).read_text(encoding="utf-8")
-    policy = jinja2.filters.Markup(page_policy(styles=[style]))
-    return environment.get_template(f"{name}.html").render(style=jinja2.filters.Markup(style), policy=policy, **values)
+    values |= {
+        "style": style,
+        "scripts": scripts,
+        "policy": page_policy(scripts=scripts, styles=[style], images=images),
+    }
+    return environment.get_template(f"{name}.html").render(values)
 
 
 def save_verdict_page(
@@ -196,7 +213,7 @@ def save_summary(path: str | Path, name: str, **values: Any) -> Path:
         FileError: the file cannot be written, or a picture cannot be read.
         InputError: a picture that is neither PNG nor JPEG.
     """
-    return write_atomic(path, _from_template(name, "summary_page.css", **values))
+    return write_atomic(path, from_template(name, style_of("summary_page"), **values))
 
 
 def _embedded(path: str | Path) -> str:
