@@ -218,6 +218,8 @@ def sparse_parts(found: rooms.StarCamera, size: tuple[int, int]) -> list[str]:
 
 # `kcal stars`: name the stars of night images, and find how the camera looks.
 
+_EARTH, _SKY = ("heading_deg", "pitch_deg", "roll_deg"), ("right_ascension_deg", "declination_deg")
+
 
 def stars_command(
     images: list[kinds.Images],
@@ -252,8 +254,11 @@ def stars_command(
     catalog = kcal.stars.StarCatalog.bundled()
     lens = single_camera(camera) if camera else camera_by_stars(files, views, "finding the lens")[0].lens.camera
     told: list[dict[str, Any]] = []
-    seen: list[tuple[str, rooms.NamedStars]] = []
-    rows = [["image", "stars", "named", "RMS px", *_heads(views[0])]]
+    seen: list[tuple[dict[str, Any], rooms.NamedStars]] = []
+    angles = ["heading", "pitch", "roll", "± east", "± north", "± up"]
+    if not views[0].on_earth:
+        angles = ["right ascension", "declination", "± x", "± y", "± z"]
+    rows = [["image", "stars", "named", "RMS px", *angles, "left out"]]
     with steps("naming stars", len(files)) as advance:
         for path, view in zip(files, views, strict=True):
             try:
@@ -268,13 +273,13 @@ def stars_command(
                 if picture is not None and not seen:
                     _draw(picture, image, found, catalog, path.name)
                 told.append(_told(path, found))
-                seen.append((path.name, found))
-                rows.append(_row(path, found))
+                seen.append((told[-1], found))
+                rows.append(_row(told[-1], found))
                 warn(*(f"{path.name}: {text}" for text in found.warnings))
             advance(path.name)
     for number, text in rooms.clock_doubts([found for _, found in seen]):
-        warn(f"{seen[number][0]}: {text}")
-        next(image for image in told if image["image"] == seen[number][0])["warnings"].append(text)
+        warn(f"{seen[number][0]['image']}: {text}")
+        seen[number][0]["warnings"].append(text)
     tell(images=told)
     if len(rows) == 1:
         raise InputError(f"in none of {len(files)} images stars have names")
@@ -284,24 +289,16 @@ def stars_command(
     print_wrote(picture)
 
 
-def _heads(view: kcal.stars.SkyView) -> list[str]:
-    if view.on_earth:
-        return ["heading", "pitch", "roll", "± east", "± north", "± up", "left out"]
-    return ["right ascension", "declination", "± x", "± y", "± z", "left out"]
-
-
-def _row(path: Path, found: rooms.NamedStars) -> list[str]:
-    angles = found.heading_pitch_roll or found.right_ascension_declination or ()
-    cells = [f"{angle:.4f}°" for angle in angles] + [f"{sigma:.4f}°" for sigma in found.sigma_deg]
+def _row(told: dict[str, Any], found: rooms.NamedStars) -> list[str]:
+    angles = [value for name, value in told.items() if name in (*_EARTH, *_SKY)]
+    cells = [f"{degrees:.4f}°" for degrees in (*angles, *told["sigma_deg"])]
     if found.view.on_earth and not found.on_earth:
-        cells = ["", "", "", "", "", ""]
-    left_out = ", ".join(f"{count} {reason}" for reason, count in found.detected.left_out.items())
-    stars = found.attitude
-    return [path.name, f"{len(found.detected.pixels)}", f"{stars.count}", f"{stars.rms_px:.3f}", *cells, left_out]
+        cells = 6 * [""]
+    left_out = ", ".join(f"{count} {reason}" for reason, count in told["left_out"].items())
+    return [told["image"], f"{told['detected']}", f"{told['identified']}", f"{told['rms_px']:.3f}", *cells, left_out]
 
 
 def _told(path: Path, found: rooms.NamedStars) -> dict[str, Any]:
-    names = ("heading_deg", "pitch_deg", "roll_deg") if found.on_earth else ("right_ascension_deg", "declination_deg")
     angles = found.heading_pitch_roll or found.right_ascension_declination or ()
     return {
         "image": path.name,
@@ -310,7 +307,7 @@ def _told(path: Path, found: rooms.NamedStars) -> dict[str, Any]:
         "identified": found.attitude.count,
         "rms_px": found.attitude.rms_px,
         "frame": "east-north-up" if found.on_earth else "celestial",
-        **dict(zip(names, angles, strict=True)),
+        **dict(zip(_EARTH if found.on_earth else _SKY, angles, strict=True)),
         "sigma_deg": list(found.sigma_deg),
         "rotation": found.attitude.rotation.tolist(),
         "left_out": dict(found.detected.left_out),

@@ -213,15 +213,11 @@ def named_cameras(rig: Rig) -> list[tuple[str, Camera]]:
 
 def _inherited(rig: Rig, cameras: Sequence[Verdict]) -> list[Finding]:
     """Findings about the cameras, with their names; a finding that several cameras share is listed once."""
+    told = [(verdict.subject, verdict.findings) for verdict in cameras]
     found: dict[Finding, list[str]] = {}
-    if cameras:
-        for verdict in cameras:
-            for finding in verdict.findings:
-                found.setdefault(finding, []).append(verdict.subject)
-    else:
-        for word, camera in named_cameras(rig):
-            for finding in stored_findings(camera):
-                found.setdefault(finding, []).append(word)
+    for name, findings in told or [(word, (*stored_findings(camera),)) for word, camera in named_cameras(rig)]:
+        for finding in findings:
+            found.setdefault(finding, []).append(name)
     return [
         dataclasses.replace(finding, cameras=tuple(names))
         for finding, names in found.items()
