@@ -16,14 +16,10 @@ from numpy.typing import NDArray
 
 import kcal
 import kcal.sim.practice as practice
+from kcal.cli import rooms
 from kcal.cli.console import err, out, print_styled, steps, tell_table, warn
 from kcal.errors import FileError
 from kcal.files import dump_json, make_folder, read_bytes, write_atomic
-from kcal.io.images import write_png, write_video
-from kcal.io.rig_file import load_pair
-from kcal.report.positions import save_site_sketch
-from kcal.report.practice_score import score_cameras, score_positions, score_rig, score_tracks
-from kcal.sim.scene import DemoScene, render_board, scene_views
 from kcal.strict_json import MOST_BYTES, read_json
 from kcal.table import Table
 
@@ -72,7 +68,7 @@ def night_name(side: str) -> str:
     return f"{side}-{NIGHT:%Y-%m-%dT%H%M%S}.png"
 
 
-def readme_text(scene: DemoScene) -> str:
+def readme_text(scene: rooms.DemoScene) -> str:
     """What is in the folder, and the commands."""
     commands = "\n".join(
         f"{number}. {step.name}\n" + "\n".join(f"   {command}" for command in step.commands)
@@ -87,7 +83,7 @@ def _template(name: str) -> str:
     return importlib.resources.files("kcal.cli").joinpath("practice", name).read_text(encoding="utf-8")
 
 
-def survey_text(scene: DemoScene) -> str:
+def survey_text(scene: rooms.DemoScene) -> str:
     """The landmarks as a surveyor hands them over: latitude, longitude, ellipsoidal height, sigma in meters."""
     origin = kcal.Origin(lat=scene.lat, lon=scene.lon, height=scene.height)
     surveyed = scene.surveyed(scene.landmarks)
@@ -196,7 +192,7 @@ def _practice_parts(site: practice.PracticeSite, frames: int) -> Iterator[tuple[
     yield Path("survey.csv"), 1, text(lambda: survey_text(site.scene))
     yield Path("targets.csv"), 1, text(targets_text)
     yield Path("find_ships.py"), 1, text(lambda: _template("find_ships.txt"))
-    for index, (side, name, pose) in enumerate(scene_views(site.scene)):
+    for index, (side, name, pose) in enumerate(rooms.scene_views(site.scene)):
         write = functools.partial(_board, site.scene, index, side, pose)
         yield Path("boards", side, f"{name.removeprefix('near-')}.png"), _BOARD_STEPS, write
     for side in practice.SIDES:
@@ -208,20 +204,20 @@ def _practice_parts(site: practice.PracticeSite, frames: int) -> Iterator[tuple[
         yield Path("video", f"{side}.mp4"), frames, functools.partial(_film, site, side, frames)
 
 
-def _board(scene: DemoScene, index: int, side: str, pose: Any, path: Path, _: Callable[[], None]) -> None:
-    image = render_board(getattr(scene.rig, side), pose, scene.near_board, scene.render, scene.generator(index))
-    write_png(path, image.numpy())
+def _board(scene: rooms.DemoScene, index: int, side: str, pose: Any, path: Path, _: Callable[[], None]) -> None:
+    image = rooms.render_board(getattr(scene.rig, side), pose, scene.near_board, scene.render, scene.generator(index))
+    rooms.write_png(path, image.numpy())
 
 
 def _picture(site: practice.PracticeSite, side: practice.Side, path: Path, _: Callable[[], None]) -> None:
-    write_png(path, site.picture(side))
+    rooms.write_png(path, site.picture(side))
 
 
 def _night(site: practice.PracticeSite, side: practice.Side, path: Path, _: Callable[[], None]) -> None:
     importlib.import_module("erfa")
     scene, catalog = site.scene, kcal.stars.StarCatalog.bundled()
     view = kcal.stars.SkyView(time=NIGHT, origin=kcal.Origin(lat=scene.lat, lon=scene.lon, height=scene.height))
-    write_png(path, practice.night_picture(site, side, view.directions(catalog), catalog.magnitude))
+    rooms.write_png(path, practice.night_picture(site, side, view.directions(catalog), catalog.magnitude))
 
 
 def _sketch(site: practice.PracticeSite, path: Path, _: Callable[[], None]) -> None:
@@ -230,7 +226,7 @@ def _sketch(site: practice.PracticeSite, path: Path, _: Callable[[], None]) -> N
         ([thing.name for thing in things], site.true_pixels("left", points.enu))
         for things, points in ((practice.LANDMARKS, scene.landmarks), (practice.TARGETS, scene.targets))
     ]
-    save_site_sketch(path, site.picture("left", noise=0.0), *groups)
+    rooms.save_site_sketch(path, site.picture("left", noise=0.0), *groups)
 
 
 def _film(site: practice.PracticeSite, side: practice.Side, count: int, path: Path, step: Callable[[], None]) -> None:
@@ -239,7 +235,7 @@ def _film(site: practice.PracticeSite, side: practice.Side, count: int, path: Pa
             yield frame
             step()
 
-    write_video(path, told(), practice.RATE)
+    rooms.write_video(path, told(), practice.RATE)
 
 
 def _detections(site: practice.PracticeSite, frames: int) -> str:
@@ -272,10 +268,10 @@ def practice_score(folder: Path) -> None:
     truth = read_truth_file(folder)
     paths = {str(side): folder / f"{side}.camera.json" for side in practice.SIDES}
     cameras = {side: kcal.load_camera(path) for side, path in paths.items() if path.exists()}
-    _show("cameras", "Cameras: error over the image after the best-fit rotation", score_cameras(cameras, truth))
-    rig = load_pair(folder / "rig.json") if (folder / "rig.json").exists() else None
+    _show("cameras", "Cameras: error over the image after the best-fit rotation", rooms.score_cameras(cameras, truth))
+    rig = rooms.load_pair(folder / "rig.json") if (folder / "rig.json").exists() else None
     what = "Rig: error of ranges over the image, with marks that have no noise"
-    _show("ranges", what, None if rig is None else score_rig(rig, truth))
+    _show("ranges", what, None if rig is None else rooms.score_rig(rig, truth))
     if rig is not None:
         true, own = truth["baseline_m"], float(rig.baseline)
         out.print(f"baseline {own:.4f} m, {1e3 * (own - true):+.1f} mm off")
@@ -311,7 +307,7 @@ def _show(name: str, what: str, table: Table | None) -> None:
 
 
 def _score_located(positions: Path | None, tracks: Path | None, truth: dict[str, Any]) -> None:
-    scores = None if positions is None else score_positions(positions, truth)
+    scores = None if positions is None else rooms.score_positions(positions, truth)
     _show("positions", "Positions: against the truth", scores)
     if scores is not None:
         known = {str(row["target"]).casefold(): row["contains"] for row in scores.records}
@@ -320,7 +316,7 @@ def _score_located(positions: Path | None, tracks: Path | None, truth: dict[str,
             out.print(f"{inside} of {len(scores.rows)} intervals contain the true range; 95 % are to be expected")
         if missing := [name for name in truth["targets"] if name.casefold() not in known]:
             out.print(f"not among the positions: {', '.join(missing)} (names as in targets.csv)")
-    found, strays = (None, 0) if tracks is None else score_tracks(tracks, truth)
+    found, strays = (None, 0) if tracks is None else rooms.score_tracks(tracks, truth)
     _show("tracks", "Tracks: against the ships", found)
     if strays:
         warn(f"{strays} tracks are near no ship")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from kcal import Localizer, load_rig, locate_points
-from kcal.cli.demo_run import simulated_site
+from kcal.cli.demo import simulated_site
 from kcal.locate import Marks
 from kcal.locate.positions import position_errors
 from kcal.sim.scene import DemoScene

@@ -158,7 +158,7 @@ def test_without_the_extra_for_videos_the_rest_is_made(
 
     (folder / "video" / "left.mp4").unlink()
     (folder / "survey.csv").unlink()
-    monkeypatch.setattr(kcal.cli.demo_practice, "write_video", missing)
+    monkeypatch.setattr("kcal.io.images.write_video", missing)
     make(folder)
     said = capsys.readouterr()
     assert "wrote 1 files" in said.out
