@@ -304,7 +304,6 @@ class Desk:
     def about(self) -> Json:
         """What does not change: frames, sizes, files."""
         pyramids = {side: self.pictures.pyramid(side, 0) for side in SIDES}
-        files = self.session.files
         return {
             "frames": self.pictures.names,
             "images": {
@@ -312,7 +311,7 @@ class Desk:
                        "top": top_level(p.image.shape)}
                 for side, p in pyramids.items()
             },
-            "files": {name: str(getattr(files, name)) for name in ("marks", "points", "landmarks", "log")},
+            "files": {name: str(path) for name, path in self.session.files._asdict().items()},
             "columns": self.session.columns,
             "cameras": self._cameras is not None,
             "hand_sigma": self.session.hand_sigma,

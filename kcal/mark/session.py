@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import errno
 import json
 import math
@@ -69,14 +68,9 @@ class Journal:
         return reversed(self._earlier)
 
     @property
-    def can_undo(self) -> bool:
-        """Whether there is anything to undo."""
-        return len(self._states) > 1
-
-    @property
-    def can_redo(self) -> bool:
-        """Whether anything was undone last."""
-        return bool(self._undone)
+    def undoable(self) -> tuple[bool, bool]:
+        """Whether there is anything to undo, and whether anything was undone last."""
+        return len(self._states) > 1, bool(self._undone)
 
     def do(self, action: marking.Change | marking.Step, key: str) -> bool:
         """Apply an action and write it down; False if an action with this key was done before.
@@ -136,7 +130,7 @@ class Journal:
         if not isinstance(action, marking.Step):
             return [*self._states, marking.applied(self.state, action)], []
         if action.do == "undo":
-            if not self.can_undo:
+            if not self.undoable[0]:
                 raise InputError("there is nothing to undo")
             return self._states[:-1], [*self._undone, self._states[-1]]
         if not self._undone:
@@ -275,8 +269,7 @@ _MARKED: tuple[marking.Kind, ...] = ("landmark", "feature")
 _LOADED = "loaded from a file"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MarkingFiles:
+class MarkingFiles(NamedTuple):
     """Where a session writes; all follow from the file of marks.
 
     Args:
@@ -295,8 +288,7 @@ class MarkingFiles:
     def beside(cls, marks: Path) -> MarkingFiles:
         """`site.csv` to `site.points.csv`, `site.landmarks.csv` and `site.log`."""
         stem = marks.with_suffix("") if marks.suffix.lower() == ".csv" else marks
-        names = (Path(f"{stem}.{end}") for end in ("points.csv", "landmarks.csv", "log"))
-        return cls(marks=marks, **dict(zip(("points", "landmarks", "log"), names, strict=True)))
+        return cls(marks, *(Path(f"{stem}.{end}") for end in ("points.csv", "landmarks.csv", "log")))
 
 
 class Session:
@@ -323,7 +315,7 @@ class Session:
         self.hand_sigma = hand_sigma
         self._lock = threading.Lock()
         self.trouble = ""
-        for path in (self.files.marks, self.files.points, self.files.landmarks, self.files.log):
+        for path in self.files:
             check_writable(path, *filter(None, (survey, targets)))
         places = NO_PLACES if survey is None else read_places(survey)
         named = () if targets is None else read_names(targets)
@@ -350,7 +342,7 @@ class Session:
     @property
     def undoable(self) -> tuple[bool, bool]:
         """Whether there is something to undo and something to redo."""
-        return self._journal.can_undo, self._journal.can_redo
+        return self._journal.undoable
 
     def do(self, action: marking.Change | marking.Step, key: str) -> marking.MarkingState:
         """Apply an action, write the log and the files, and return the new state; see `Journal.do`.
@@ -376,10 +368,6 @@ class Session:
             if self.trouble:
                 self._write()
             self._journal.close()
-
-    def marks(self, *kinds: marking.Kind, single: bool = True) -> Marks:
-        """The marks of these kinds; of items marked in both images only, if not `single`."""
-        return marks_of(self.state, kinds, single=single)
 
     def _write(self) -> None:
         state = self.state

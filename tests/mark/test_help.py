@@ -336,7 +336,7 @@ class TestDrift:
                 if not found["refusal"]:
                     mark = Mark(u=found["u"], v=found["v"], cov=found["cov"], how="again", frame="left")
                     session.do(Put(do="put", name=name, side=cast("Side", side), mark=mark), f"{side}-{number:05d}")
-        now = session.marks("feature", single=False)
+        now = marks_of(session.state, ("feature",), single=False)
         desk.close()
         assert len(now.names) >= 10
         drift = check_rig(site.rig, features=seen_again(then, now, 0.05))
