@@ -18,6 +18,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 from torch import Tensor
 
+import kcal.report.figures as figures
 from kcal.calibrate.camera.advice import reached, unreached_share
 from kcal.calibrate.camera.at_setting import ComparisonResult
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult
@@ -29,35 +30,15 @@ from kcal.corners.observations import Observations, View
 from kcal.errors import FileError
 from kcal.lens.difference import CameraDifference, difference_text
 from kcal.lens.uncertainty import image_sigma
-from kcal.report.figures import (
-    ACCENT,
-    FAINT,
-    GRAY,
-    HALO,
-    INK,
-    WARN,
-    add_color_bar,
-    draw_arrows,
-    draw_values,
-    finished,
-    frame_image,
-    framed_figure,
-    image_figure,
-    image_panel,
-    one_panel,
-    round_levels,
-    shortened,
-    whole,
-)
 from kcal.texts import measured_text, number_text, percent_text
 from kcal.threads import in_one_thread
 
 # Draw a calibration: where the board was seen, the residuals, and the RMS of each view.
 
 # Of boards that are far, dark, to those that are near.
-_NEAR_COLORS = LinearSegmentedColormap.from_list("near", [INK, ACCENT, "#e08214"])
+_NEAR_COLORS = LinearSegmentedColormap.from_list("near", [figures.INK, figures.ACCENT, "#e08214"])
 # Of a view's RMS: pale below the median, blue at the median, magenta from twice the median on.
-_RMS_COLORS = LinearSegmentedColormap.from_list("rms", ["#bcd6ee", ACCENT, WARN])
+_RMS_COLORS = LinearSegmentedColormap.from_list("rms", ["#bcd6ee", figures.ACCENT, figures.WARN])
 
 
 @in_one_thread
@@ -96,27 +77,27 @@ def calibration_figure(
         4
     """
     model = "" if result.hybrid is not None else f", model {result.camera.model}"
-    whose = f"{shortened(name, 60)}: " if name else ""
+    whose = f"{figures.shortened(name, 60)}: " if name else ""
     total = len(result.observations.views)
     used = total - len({view.view for view in result.rejected_views})
     views = f"{used} of {total} views" if used < total else f"{total} views"
     width, height = result.observations.image_size
     tall = min(5.9 * height / width, 8.0)
     title = f"{whose}{views}{model}, RMS {result.rms:.3f} px"
-    figure = framed_figure(13.5, tall + 4.4, title, into=figure)
+    figure = figures.framed_figure(13.5, tall + 4.4, title, into=figure)
     above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(tall + 0.9, 3.5)))
     images, bars = above.subplots(1, 2), below.subplots(1, 2, width_ratios=(1.0, 2.4))
     draw_coverage(images[0], result)
     draw_uncertainty(images[1], result)
     draw_residuals(bars[0], result)
     draw_view_rms(bars[1], result)
-    return whole(figure)
+    return figures.whole(figure)
 
 
 def draw_coverage(axes: Axes, result: CameraCalibrationResult) -> None:
     """Draw corners and magnified residuals in the colors of their views' RMS."""
     width = result.observations.image_size[0]
-    frame_image(axes, result.observations.image_size)
+    figures.frame_image(axes, result.observations.image_size)
     pixels = result.observations.pixels().numpy()
     errors = -result.residuals.numpy()
     # Views that were left out have corners and no residuals.
@@ -126,14 +107,14 @@ def draw_coverage(axes: Axes, result: CameraCalibrationResult) -> None:
     norm = _rms_norm(result)
     # A typical residual is drawn as long as a sixtieth of the image.
     wanted = width / 60 / max(float(np.sqrt(np.mean(error**2))), 1e-9)
-    draw_arrows(axes, where, error, wanted, "px", rms, cmap=_RMS_COLORS, norm=norm, width=0.002)
+    figures.draw_arrows(axes, where, error, wanted, "px", rms, cmap=_RMS_COLORS, norm=norm, width=0.002)
     drawn = axes.scatter(where[:, 0], where[:, 1], c=rms, cmap=_RMS_COLORS, norm=norm, s=4, linewidths=0)
     grid = result.camera.grid(97, 73)
     valid = result.camera.unproject(grid)[1].numpy()
     if not valid.all():
-        axes.contourf(*grid.unbind(-1), ~valid, levels=[0.5, 1.5], colors=[WARN], alpha=0.25)
-        axes.text(0.02, 0.02, "shaded: no valid ray", transform=axes.transAxes, color=WARN, fontsize=9)
-    add_color_bar(drawn, axes, "RMS of the view, px", extend="max")
+        axes.contourf(*grid.unbind(-1), ~valid, levels=[0.5, 1.5], colors=[figures.WARN], alpha=0.25)
+        axes.text(0.02, 0.02, "shaded: no valid ray", transform=axes.transAxes, color=figures.WARN, fontsize=9)
+    figures.add_color_bar(drawn, axes, "RMS of the view, px", extend="max")
     axes.set_title("Corners and residuals", fontsize=10, loc="left")
 
 
@@ -145,7 +126,7 @@ def _rms_norm(result: CameraCalibrationResult) -> Normalize:
 def draw_uncertainty(axes: Axes, result: CameraCalibrationResult) -> None:
     """Draw σ of the image of distant points."""
     width, height = result.observations.image_size
-    frame_image(axes, (width, height))
+    figures.frame_image(axes, (width, height))
     known = result.camera.calibration
     if known is None or known.known(result.camera.params) is None:
         axes.set_title("No covariance: σ in the image is not known", fontsize=10, loc="left")
@@ -155,13 +136,13 @@ def draw_uncertainty(axes: Axes, result: CameraCalibrationResult) -> None:
     places = result.camera.grid(columns, rows).numpy()
     good = np.isfinite(sigma)
     low, high = np.quantile(sigma[good], [0.0, 0.98])
-    levels = round_levels(max(low, 1e-6), max(high, 2e-6))
-    shown = draw_values(axes, places, np.where(good, sigma, np.nan), levels, extend="both")
+    levels = figures.round_levels(max(low, 1e-6), max(high, 2e-6))
+    shown = figures.draw_values(axes, places, np.where(good, sigma, np.nan), levels, extend="both")
     lines = axes.contour(places[..., 0], places[..., 1], sigma, levels=levels, colors="white", linewidths=0.6)
     axes.clabel(lines, fontsize=8, fmt="%g")
     _draw_reached(axes, result.observations)
     axes.set_title("Uncertainty; dashed: boards' reach", fontsize=10, loc="left")
-    add_color_bar(shown, axes, "σ in the image, px")
+    figures.add_color_bar(shown, axes, "σ in the image, px")
 
 
 def _draw_reached(axes: Axes, observations: Observations) -> None:
@@ -170,7 +151,7 @@ def _draw_reached(axes: Axes, observations: Observations) -> None:
     seen = reached(observations, 256, max(2, round(256 * height / width))).numpy()
     if not seen.all():
         columns, rows = (np.linspace(-0.5, n - 0.5, count) for n, count in ((width, 256), (height, len(seen))))
-        axes.contour(columns, rows, seen, levels=[0.5], colors=INK, linewidths=1.0, linestyles="dashed")
+        axes.contour(columns, rows, seen, levels=[0.5], colors=figures.INK, linewidths=1.0, linestyles="dashed")
 
 
 def draw_residuals(axes: Axes, result: CameraCalibrationResult) -> None:
@@ -179,18 +160,20 @@ def draw_residuals(axes: Axes, result: CameraCalibrationResult) -> None:
     error = error[np.isfinite(error).all(-1)]
     sigma = float(np.sqrt(np.mean(error**2)))
     limit = max(5.0 * sigma, 1e-9)
-    axes.scatter(error[:, 0], error[:, 1], s=5, color=ACCENT, alpha=0.45, linewidths=0)
+    axes.scatter(error[:, 0], error[:, 1], s=5, color=figures.ACCENT, alpha=0.45, linewidths=0)
     turn = np.linspace(0, 2 * np.pi, 200)
     # 95 % of a circular Gaussian lie within 2.45 σ.
-    axes.plot(2.448 * sigma * np.cos(turn), 2.448 * sigma * np.sin(turn), color=INK, linewidth=1)
+    axes.plot(2.448 * sigma * np.cos(turn), 2.448 * sigma * np.sin(turn), color=figures.INK, linewidth=1)
     outside = float(np.mean(np.hypot(*error.T) > 2.448 * sigma))
-    axes.axhline(0, color=FAINT, linewidth=0.6)
-    axes.axvline(0, color=FAINT, linewidth=0.6)
+    axes.axhline(0, color=figures.FAINT, linewidth=0.6)
+    axes.axvline(0, color=figures.FAINT, linewidth=0.6)
     axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="u, pixels", ylabel="v, pixels")
     axes.locator_params(nbins=5)
     axes.set_title(f"Residuals: σ {sigma:.3f} px per axis", fontsize=10, loc="left")
     text = f"{100 * outside:.1f} % outside the 95 % circle"
-    axes.text(0.03, 0.97, text, transform=axes.transAxes, fontsize=9, color=INK, va="top", path_effects=HALO)
+    axes.text(
+        0.03, 0.97, text, transform=axes.transAxes, fontsize=9, color=figures.INK, va="top", path_effects=figures.HALO
+    )
 
 
 def draw_view_rms(axes: Axes, result: CameraCalibrationResult) -> None:
@@ -198,12 +181,12 @@ def draw_view_rms(axes: Axes, result: CameraCalibrationResult) -> None:
     rms = result.per_view_rms.numpy()
     place = np.arange(len(rms))
     axes.bar(place, rms, color=_RMS_COLORS(_rms_norm(result)(rms)), width=0.8)
-    axes.axhline(float(np.nanmedian(rms)), color=INK, linewidth=0.8)
+    axes.axhline(float(np.nanmedian(rms)), color=figures.INK, linewidth=0.8)
     axes.set_ylabel("RMS, pixels")
     axes.set_title("RMS of each view; line: median", fontsize=10, loc="left")
     if len(rms) <= 40:
         names = [name.rsplit(".", 1)[0] for name in result.observations.names]
-        axes.set_xticks(place, [shortened(name, 20) for name in names], rotation=90, fontsize=7)
+        axes.set_xticks(place, [figures.shortened(name, 20) for name in names], rotation=90, fontsize=7)
     else:
         axes.set_xlabel("view")
 
@@ -245,35 +228,35 @@ def board_figure(board: MeasuredBoard, ax: Axes | None = None) -> Figure:
     square = 1e3 * board.board.square
     head = [*board_text(board), "colors: height over the best plane; arrows: displacement in the plane"]
     tall_inches = min(9.0, 7.0 * (tall + 2 * square) / (wide + 2 * square)) + 0.8
-    axes = one_panel(ax, 9.0, tall_inches, f"{board.name}: {board.board}", head)
+    axes = figures.one_panel(ax, 9.0, tall_inches, f"{board.name}: {board.board}", head)
     most = max(float(np.abs(heights).max()), _LEAST)
     levels = MaxNLocator(nbins=20, symmetric=True).tick_values(-1.0001 * most, 1.0001 * most)
-    drawn = draw_values(axes, places.view(down, _ACROSS, 3).numpy(), heights, list(levels), "RdBu_r")
-    add_color_bar(drawn, axes, "height, mm (positive: away from the cameras)", ticks=levels[::2])
-    axes.plot(corners[:, 0], corners[:, 1], ".", color=GRAY, markersize=3)
+    drawn = figures.draw_values(axes, places.view(down, _ACROSS, 3).numpy(), heights, list(levels), "RdBu_r")
+    figures.add_color_bar(drawn, axes, "height, mm (positive: away from the cameras)", ticks=levels[::2])
+    axes.plot(corners[:, 0], corners[:, 1], ".", color=figures.GRAY, markersize=3)
     longest = max(float(np.linalg.norm(moved, axis=-1).max()), _LEAST)
     axes.set(xlim=(low[0] - square, high[0] + square), ylim=(high[1] + square, low[1] - square), aspect="equal")
     axes.set(xlabel="x, mm", ylabel="y, mm")
     # The longest arrow is nearly as long as the corners are apart.
-    draw_arrows(axes, corners[:, :2].numpy(), moved, 0.9 * square / longest, "mm", width=0.0028)
+    figures.draw_arrows(axes, corners[:, :2].numpy(), moved, 0.9 * square / longest, "mm", width=0.0028)
     axes.spines[["top", "right"]].set_visible(False)
-    return finished(axes)
+    return figures.finished(axes)
 
 
 def models_figure(compared: ComparisonResult, title: str = "", ax: Axes | None = None) -> Figure:
     """Draw the held-out RMS of each model, the best first, with the standard error of its difference from the best."""
     ranked = [entry for entry in compared.ranking if math.isfinite(entry[1])]
     names, rms, _, error = zip(*ranked, strict=True)
-    axes = one_panel(ax, 7.6, 1.1 + 0.45 * len(ranked), title)
-    axes.axvline(rms[0], color=FAINT, linewidth=0.8)
-    axes.errorbar(rms, range(len(ranked)), xerr=error, fmt="o", color=ACCENT, capsize=4)
+    axes = figures.one_panel(ax, 7.6, 1.1 + 0.45 * len(ranked), title)
+    axes.axvline(rms[0], color=figures.FAINT, linewidth=0.8)
+    axes.errorbar(rms, range(len(ranked)), xerr=error, fmt="o", color=figures.ACCENT, capsize=4)
     axes.set_yticks(range(len(ranked)), names)
     axes.set(
         ylim=(len(ranked) - 0.5, -0.5),
         xlabel="held-out RMS, px (bars: ± standard error of the difference from the best)",
     )
     axes.spines[["top", "right"]].set_visible(False)
-    return finished(axes)
+    return figures.finished(axes)
 
 
 # Draw where stated intervals contain the truth: maps of the image, from repeated captures.
@@ -303,13 +286,13 @@ def interval_figure(check: IntervalCheck, observations: Observations, title: str
     """
     shown = list(zip(check.ranges, check.coverage, check.shares, strict=True))[:_MOST]
     notes = [f"Share of {len(check.errors)} refits within the stated 95 % ellipse. Dashed: where boards were seen."]
-    figure, panels = image_figure(observations.image_size, len(shown), title, notes)
+    figure, panels = figures.image_figure(observations.image_size, len(shown), title, notes)
     for axes, (at, coverage, (share, error)) in zip(panels, shown, strict=True):
-        drawn = draw_values(axes, check.pixels.numpy(), coverage.numpy(), _LEVELS, "RdYlBu")
+        drawn = figures.draw_values(axes, check.pixels.numpy(), coverage.numpy(), _LEVELS, "RdYlBu")
         _draw_reached(axes, observations)
         axes.set_title(f"{range_label(at)}: {100 * share:.1f} ± {100 * error:.1f} %", fontsize=10, loc="left")
     percent = FuncFormatter(lambda value, _: f"{100 * value:g} %")
-    add_color_bar(drawn, panels[-1], "share of refits (95 % is right)", format=percent, ticks=_LEVELS)
+    figures.add_color_bar(drawn, panels[-1], "share of refits (95 % is right)", format=percent, ticks=_LEVELS)
     return figure
 
 
@@ -368,7 +351,7 @@ def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = (
     if observations.failures:
         title += f"; without a board: {len(observations.failures)}"
     gap = 0.7 if failed else 0.35  # room for reasons
-    figure = framed_figure(3.6 * across + 0.3, down * (3.5 * height / width + gap), title, listed[:10], 110)
+    figure = figures.framed_figure(3.6 * across + 0.3, down * (3.5 * height / width + gap), title, listed[:10], 110)
     for place, tile in enumerate(tiles, 1):
         axes = figure.add_subplot(down, across, place)
         if isinstance(tile, View):
@@ -400,19 +383,19 @@ def coverage_figure(observations: Observations, ax: Axes | None = None) -> Figur
         cells += once > 0
     share = percent_text(1.0 - unreached_share(observations))
     title = f"{len(pixels)} views, {int(seen.sum())} corners; boards reached {share} of the image, hatched: not"
-    axes = image_panel(ax, (width, height), title, ["Gray: how many views reached a part of the image."])
+    axes = figures.image_panel(ax, (width, height), title, ["Gray: how many views reached a part of the image."])
     whole = (-0.5, width - 0.5, height - 0.5, -0.5)
     axes.imshow(cells, cmap="Grays", vmin=0, vmax=2.5 * max(cells.max(), 1), extent=whole)
     outside = ~reached(observations, 4 * 65, max(2, round(4 * 65 * height / width))).numpy()
     if outside.any():
         x, y = (np.linspace(-0.5, n - 0.5, m) for n, m in zip((width, height), outside.shape[::-1], strict=True))
         hatched = axes.contourf(x, y, outside, levels=[0.5, 1.5], colors="none", hatches=["///"])
-        hatched.set_edgecolor((WARN, 0.5))
+        hatched.set_edgecolor((figures.WARN, 0.5))
         hatched.set_linewidth(0.0)
     apart = _spacing(observations)[views]
     drawn = axes.scatter(u, v, c=apart, cmap=_NEAR_COLORS, s=9, linewidths=0)
-    add_color_bar(drawn, axes, "distance between corners, px (large: board near)")
-    return finished(axes)
+    figures.add_color_bar(drawn, axes, "distance between corners, px (large: board near)")
+    return figures.finished(axes)
 
 
 def _spacing(observations: Observations) -> NDArray[np.float64]:
@@ -444,30 +427,30 @@ def _predicted_sigma(view: View) -> float | None:
 def _draw_tile(axes: Axes, path: str | Path | None, size: tuple[int, int], title: str, color: str) -> None:
     whole = (-0.5, size[0] - 0.5, size[1] - 0.5, -0.5)
     axes.imshow(_thumbnail(path, size), cmap="gray", vmin=0, vmax=255, extent=whole)
-    frame_image(axes, size)
+    figures.frame_image(axes, size)
     axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
     axes.set_title(title, fontsize=8, loc="left", pad=3, color=color)
 
 
 def _draw_view(axes: Axes, observations: Observations, view: View) -> None:
     sigma, unseen = _predicted_sigma(view), int((~view.seen).sum())
-    text = shortened(view.name, 34) + (f"  σ {sigma:.3f} px" if sigma is not None else "")
+    text = figures.shortened(view.name, 34) + (f"  σ {sigma:.3f} px" if sigma is not None else "")
     text += f"  {unseen} left out" if unseen else ""
-    _draw_tile(axes, view.image, observations.image_size, text, WARN if unseen else INK)
+    _draw_tile(axes, view.image, observations.image_size, text, figures.WARN if unseen else figures.INK)
     places = view.places
-    axes.plot(*places[: observations.board.columns].T, color=ACCENT, linewidth=1.2)
-    axes.scatter(places[:, 0], places[:, 1], s=9, color=WARN, linewidths=0)
-    axes.scatter(places[:1, 0], places[:1, 1], s=60, facecolors="none", edgecolors=ACCENT, linewidths=1.6)
+    axes.plot(*places[: observations.board.columns].T, color=figures.ACCENT, linewidth=1.2)
+    axes.scatter(places[:, 0], places[:, 1], s=9, color=figures.WARN, linewidths=0)
+    axes.scatter(places[:1, 0], places[:1, 1], s=60, facecolors="none", edgecolors=figures.ACCENT, linewidths=1.6)
 
 
 def _draw_failed(axes: Axes, failed: FailedImage, size: tuple[int, int]) -> None:
-    text = textwrap.wrap(f"failed: {shortened(failed.name, 34)}: {failed.reason}", 62)[:3]
-    _draw_tile(axes, failed.path, size, "\n".join(text), WARN)
+    text = textwrap.wrap(f"failed: {figures.shortened(failed.name, 34)}: {failed.reason}", 62)[:3]
+    _draw_tile(axes, failed.path, size, "\n".join(text), figures.WARN)
     if failed.rejected is not None:
         u, v = failed.rejected.numpy().T
-        axes.scatter(u, v, s=16, marker="x", color=WARN, linewidths=1.0)
+        axes.scatter(u, v, s=16, marker="x", color=figures.WARN, linewidths=1.0)
     for spine in axes.spines.values():
-        spine.set(visible=True, color=WARN, linewidth=2.0)
+        spine.set(visible=True, color=figures.WARN, linewidth=2.0)
 
 
 def _thumbnail(path: str | Path | None, size: tuple[int, int]) -> npt.NDArray[np.uint8]:
@@ -512,15 +495,15 @@ def difference_figure(
     low, high = (value.flatten(0, 1) for value in (found.pixels.amin((0, 1), True), found.pixels.amax((0, 1), True)))
     width, height = (round(float(value)) for value in (high - low)[0] + (1.0 if float(low[0, 0]) >= 0 else 0.0))
     sizes = [found.length.numpy()] + ([sigma.numpy()] if sigma is not None else [])
-    figure, panels = image_figure((width, height), len(sizes), title, lines, narrow)
+    figure, panels = figures.image_figure((width, height), len(sizes), title, lines, narrow)
     places = found.pixels.numpy()
     most = max(float(np.nanmax(values)) for values in sizes)
     least = min(float(np.nanquantile(values, 0.05)) for values in sizes)
-    levels = round_levels(max(least, most / 1000.0, 1e-7), max(most, 1e-6), least=3)
+    levels = figures.round_levels(max(least, most / 1000.0, 1e-7), max(most, 1e-6), least=3)
     for axes, values in zip(panels, sizes, strict=True):
-        drawn = draw_values(axes, places, values, levels, extend="min")
+        drawn = figures.draw_values(axes, places, values, levels, extend="min")
         if narrow or axes is panels[-1]:
-            add_color_bar(drawn, axes, "px, on a logarithmic scale", ticks=levels)
+            figures.add_color_bar(drawn, axes, "px, on a logarithmic scale", ticks=levels)
     step = max(1, math.ceil(places.shape[1] / _ARROWS))
     # The border is no place for an arrow: half of those would be outside.
     shown = np.nan_to_num(found.shift.numpy())[step // 2 :: step, step // 2 :: step]
@@ -528,7 +511,7 @@ def difference_figure(
     # Of a camera and itself, rounding alone is left.
     if longest > 1e-6:
         wanted = 1.5 * step * width / places.shape[1] / longest
-        draw_arrows(panels[0], places[step // 2 :: step, step // 2 :: step], shown, wanted, width=0.004)
+        figures.draw_arrows(panels[0], places[step // 2 :: step, step // 2 :: step], shown, wanted, width=0.004)
     for axes, text in zip(panels, ("Difference", "Its standard deviation σ"), strict=False):
         axes.set_title(text, fontsize=10, loc="left")
     return figure

@@ -17,6 +17,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 from torch import Tensor
 
+import kcal.report.figures as figures
 from kcal.errors import InputError
 from kcal.locate.budget import RangeError
 from kcal.locate.geodesy import geodetic_to_enu
@@ -24,31 +25,6 @@ from kcal.locate.positions import Located, Position, field_azimuths, region_outl
 from kcal.locate.siting import Area, RankedSite, Site, SitingMap, siting_map
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.tabulate import middle_row_ends
-from kcal.report.figures import (
-    ACCENT,
-    CAMERA_COLORS,
-    FAINT,
-    GRAY,
-    HALO,
-    INK,
-    WARN,
-    RangeScale,
-    add_color_bar,
-    draw_field,
-    draw_north,
-    draw_way,
-    field_outline,
-    finished,
-    framed_figure,
-    name_point,
-    new_figure,
-    one_panel,
-    plain_number,
-    round_levels,
-    save_picture,
-    shortened,
-    whole,
-)
 from kcal.report.tables import range_sigma, range_unit
 from kcal.texts import Unit, length_text, range_text
 
@@ -109,14 +85,16 @@ def positions_figure(located: Located, truth: Tensor | None = None, figure: Figu
     shown = [i for i, position in enumerate(located.positions) if position.range_low_m is not None]
     scale = _scale_of(located, true_enu)
     place = f"{located.place.lat:.6f}°, {located.place.lon:.6f}°, heading {located.heading_deg:g}°"
-    figure = framed_figure(13.0, 6.8, f"{located.count_note}, from {place}", _interval_notes(located), into=figure)
+    figure = figures.framed_figure(
+        13.0, 6.8, f"{located.count_note}, from {place}", _interval_notes(located), into=figure
+    )
     plan, ranges = figure.subplots(1, 2, width_ratios=[1.45, 1.0])
     _draw_map(plan, located, true_enu, shown, scale)
     _draw_ranges(ranges, located, true_enu, shown)
-    return whole(figure)
+    return figures.whole(figure)
 
 
-def _scale_of(located: Located, true_enu: Array | None) -> RangeScale:
+def _scale_of(located: Located, true_enu: Array | None) -> figures.RangeScale:
     ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
     if true_enu is not None:
         ranges += list(np.hypot(true_enu[:, 0], true_enu[:, 1]))
@@ -124,15 +102,15 @@ def _scale_of(located: Located, true_enu: Array | None) -> RangeScale:
     highs = [p.range_high_m for p in located.positions if p.status == PositionStatus.OK and p.range_high_m is not None]
     # One wide interval must not squeeze everything else.
     reach = max([max(ranges), *(min(high, 2.5 * max(ranges)) for high in highs)])
-    return RangeScale(nearest=min(ranges), rim=1.25 * reach)
+    return figures.RangeScale(nearest=min(ranges), rim=1.25 * reach)
 
 
-def _polar(scale: RangeScale, azimuth_deg: float | Array, meters: float | Array) -> Array:
+def _polar(scale: figures.RangeScale, azimuth_deg: float | Array, meters: float | Array) -> Array:
     azimuth = np.radians(azimuth_deg)
     return np.stack([np.sin(azimuth) * scale.radius(meters), np.cos(azimuth) * scale.radius(meters)], -1)
 
 
-def _arcs(scale: RangeScale) -> list[float]:
+def _arcs(scale: figures.RangeScale) -> list[float]:
     """Choose round ranges that are far enough from each other to be labeled."""
     chosen: list[float] = []
     for arc in _ARCS:
@@ -142,7 +120,9 @@ def _arcs(scale: RangeScale) -> list[float]:
     return sorted(chosen)
 
 
-def _draw_map(axes: Axes, located: Located, true_enu: Array | None, shown: list[int], scale: RangeScale) -> None:
+def _draw_map(
+    axes: Axes, located: Located, true_enu: Array | None, shown: list[int], scale: figures.RangeScale
+) -> None:
     # Azimuths count from the heading here, so that a view across north is one stretch.
     edges = [(a - located.heading_deg + 180) % 360 - 180 for c in located.cameras for a in c.azimuths_deg or ()]
     low, high = (min(edges), max(edges)) if edges else (-180.0, 180.0)
@@ -154,23 +134,23 @@ def _draw_map(axes: Axes, located: Located, true_enu: Array | None, shown: list[
     for arc in _arcs(scale):
         line = _polar(scale, sweep, arc)
         extent.append(line)
-        axes.plot(*line.T, color=FAINT, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
+        axes.plot(*line.T, color=figures.FAINT, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
         direction = line[-1] - line[-2]
         place = line[-1] + direction / np.hypot(*direction) * 0.012
         labels.append(place)
         turn = (90.0 - sweep[-1]) % 180.0 - 90.0
         outward = direction[0] >= 0
         axes.text(
-            place[0], place[1], range_text(arc), fontsize=8.5, color=GRAY, rotation=turn,
+            place[0], place[1], range_text(arc), fontsize=8.5, color=figures.GRAY, rotation=turn,
             rotation_mode="anchor", ha="left" if outward else "right", va="center",
         )  # fmt: skip
-    for camera, color in zip(located.cameras, CAMERA_COLORS, strict=False):
+    for camera, color in zip(located.cameras, figures.CAMERA_COLORS, strict=False):
         foot = np.asarray(camera.enu[:2])
         if camera.azimuths_deg is not None:
             first, last = camera.azimuths_deg
-            wedge = scale.place(field_outline(foot, math.radians(first), math.radians(last), scale.rim))
+            wedge = scale.place(figures.field_outline(foot, math.radians(first), math.radians(last), scale.rim))
             extent.append(wedge)
-            draw_field(axes, wedge, color)
+            figures.draw_field(axes, wedge, color)
         axes.plot(*scale.place(foot), "o", color=color, markersize=7, zorder=6, label=f"{camera.name} camera")
     for i in shown:
         position = located.positions[i]
@@ -179,17 +159,17 @@ def _draw_map(axes: Axes, located: Located, true_enu: Array | None, shown: list[
             _draw_truth(axes, position, scale.place(true_enu[i]), scale)
     points = [scale.place(np.asarray(located.positions[i].enu)) for i in shown if located.positions[i].enu]
     if points:
-        style: dict[str, Any] = {"color": INK, "markerfacecolor": "white", "markersize": 6, "zorder": 7}
+        style: dict[str, Any] = {"color": figures.INK, "markerfacecolor": "white", "markersize": 6, "zorder": 7}
         axes.plot(*np.stack(points).T, "o", label="estimated", **style)
     if true_enu is not None:
-        axes.plot([], [], "x", color=WARN, markeredgewidth=1.6, label="true (arrow to estimated)")
+        axes.plot([], [], "x", color=figures.WARN, markeredgewidth=1.6, label="true (arrow to estimated)")
     if len(shown) <= _NAMED:
         _draw_names(axes, located, shown, scale, labels)
     box = np.concatenate(extent)
     (left, bottom), (right, top) = box.min(0) - 0.05, box.max(0) + 0.05
     axes.set(xlim=(left - 0.04, right + 0.08), ylim=(bottom, top), aspect="equal", anchor="C")
     axes.axis("off")
-    draw_north(axes, 0.03)
+    figures.draw_north(axes, 0.03)
     axes.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.005), ncols=4, fontsize=9, frameon=False, handletextpad=0.3,
         columnspacing=1.4,
@@ -197,7 +177,7 @@ def _draw_map(axes: Axes, located: Located, true_enu: Array | None, shown: list[
     axes.set_title("From above, range on a logarithmic scale", fontsize=10, loc="left")
 
 
-def _draw_sight(axes: Axes, position: Position, scale: RangeScale) -> None:
+def _draw_sight(axes: Axes, position: Position, scale: figures.RangeScale) -> None:
     """Draw the interval along the line of sight; dashed if only the bearing is known."""
     low, high, azimuth = position.range_low_m, position.range_high_m, position.azimuth_deg
     if low is None or high is None or azimuth is None:
@@ -205,22 +185,22 @@ def _draw_sight(axes: Axes, position: Position, scale: RangeScale) -> None:
     tilt = math.cos(math.radians(position.elevation_deg or 0.0))
     known = position.status == PositionStatus.OK
     start, end = _polar(scale, azimuth, low * tilt), _polar(scale, azimuth, min(high * tilt, scale.rim))
-    color = INK if known else _UNSURE
+    color = figures.INK if known else _UNSURE
     style: dict[str, Any] = {"linewidth": 2.6, "alpha": 0.45} if known else {"linewidth": 1.4, "linestyle": (0, (3, 2))}
     axes.plot(*np.stack([start, end]).T, color=color, solid_capstyle="butt", zorder=3, **style)
     if high * tilt > scale.rim:
-        draw_way(axes, start + 0.97 * (end - start), end, color, alpha=0.8)
+        figures.draw_way(axes, start + 0.97 * (end - start), end, color, alpha=0.8)
 
 
-def _draw_truth(axes: Axes, position: Position, true: Array, scale: RangeScale) -> None:
-    axes.plot(*true, "x", color=WARN, markersize=7, markeredgewidth=1.6, zorder=8)
+def _draw_truth(axes: Axes, position: Position, true: Array, scale: figures.RangeScale) -> None:
+    axes.plot(*true, "x", color=figures.WARN, markersize=7, markeredgewidth=1.6, zorder=8)
     if position.enu is not None:
         estimate = scale.place(np.asarray(position.enu))
         if np.hypot(*(estimate - true)) > 0.012:
-            draw_way(axes, true, estimate, WARN, "->", linewidth=1.3)
+            figures.draw_way(axes, true, estimate, figures.WARN, "->", linewidth=1.3)
 
 
-def _draw_names(axes: Axes, located: Located, shown: list[int], scale: RangeScale, labels: list[Array]) -> None:
+def _draw_names(axes: Axes, located: Located, shown: list[int], scale: figures.RangeScale, labels: list[Array]) -> None:
     """Write each name beside its point, away from other points and from the labels of the arcs."""
     anchors = []
     for i in shown:
@@ -232,7 +212,7 @@ def _draw_names(axes: Axes, located: Located, shown: list[int], scale: RangeScal
     for i, anchor in zip(shown, anchors, strict=True):
         others = [other - anchor for other in [*anchors, *labels] if other is not anchor]
         crowded = any(0 < other[0] < 0.2 and abs(other[1]) < 0.04 for other in others)
-        name_point(axes, anchor, located.positions[i].name, (-8 if crowded else 8, 0), zorder=9)
+        figures.name_point(axes, anchor, located.positions[i].name, (-8 if crowded else 8, 0), zorder=9)
 
 
 def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: list[int]) -> None:
@@ -244,18 +224,18 @@ def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: li
     limit = 1.3 * min(max([0.001, *ends]), _LONGEST * float(np.median(ends or [1.0])) or 1.0, 1.5)
     for row, (i, (low, high, true)) in enumerate(zip(order, spans, strict=True)):
         position = located.positions[i]
-        color = INK if position.status == PositionStatus.OK else _UNSURE
+        color = figures.INK if position.status == PositionStatus.OK else _UNSURE
         axes.plot((max(low, -limit), min(high, limit)), [row, row], color=color, linewidth=5, alpha=0.4,
                   solid_capstyle="butt")  # fmt: skip
         for end in (low, high):
             if abs(end) > limit:
                 axes.plot(math.copysign(limit, end), row, ">" if end > 0 else "<", color=color, ms=7, clip_on=False)
         if position.range_m is not None:
-            axes.plot(0.0, row, "o", color=INK, markerfacecolor="white", markersize=6, zorder=3)
+            axes.plot(0.0, row, "o", color=figures.INK, markerfacecolor="white", markersize=6, zorder=3)
         if true is not None:
             marker = "x" if abs(true) <= limit else ">" if true > 0 else "<"
             style: dict[str, Any] = {
-                "color": WARN,
+                "color": figures.WARN,
                 "markersize": 7,
                 "markeredgewidth": 1.6,
                 "zorder": 4,
@@ -267,11 +247,16 @@ def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: li
     axes.set(xlim=(-limit, limit), ylim=(len(order) - 0.3, -0.7), yticks=[])
     if len(order) <= _NAMED:
         unit, size = range_unit(located), 9 if len(order) <= 20 else 7
-        names = [f"{shortened(located.positions[i].name, 40)}  {_estimate(located.positions[i], unit)}" for i in order]
+        names = [
+            f"{figures.shortened(located.positions[i].name, 40)}  {_estimate(located.positions[i], unit)}"
+            for i in order
+        ]
         axes.set_yticks(range(len(order)), names, fontsize=size)
         for row, (i, span) in enumerate(zip(order, spans, strict=True)):
             text = _interval_text(located.positions[i], *span[:2], unit)
-            axes.text(1.03, row, text, transform=axes.get_yaxis_transform(), va="center", fontsize=size, color=GRAY)
+            axes.text(
+                1.03, row, text, transform=axes.get_yaxis_transform(), va="center", fontsize=size, color=figures.GRAY
+            )
     axes.grid(axis="x", color="#e5e7eb", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right", "left"]].set_visible(False)
@@ -324,37 +309,37 @@ def stations_figure(located: Located, truth: Tensor | None = None, ax: Axes | No
         ax: of yours, to draw into.
     """
     notes = ["Outlines: 95 % regions. Dashed: bearings without a range."]
-    axes = one_panel(ax, 8.0, 7.0, located.count_note, notes)
+    axes = figures.one_panel(ax, 8.0, 7.0, located.count_note, notes)
     towers = torch.tensor([camera.enu[:2] for camera in located.cameras], dtype=torch.float64)
     found = located.enu[located.enu.isfinite().all(-1)]
     shown = torch.cat([towers, found[:, :2]])
     reach = _REACH * max(float((shown.amax(0) - shown.amin(0)).amax()), 1.0) / 1e3
     for number, (camera, place) in enumerate(zip(located.cameras, (towers / 1e3).numpy(), strict=True)):
-        color, sweep = CAMERA_COLORS[number % len(CAMERA_COLORS)], field_azimuths(camera)
+        color, sweep = figures.CAMERA_COLORS[number % len(figures.CAMERA_COLORS)], field_azimuths(camera)
         if sweep is not None:
             angle = torch.deg2rad(sweep)
             rim = place + reach * torch.stack([angle.sin(), angle.cos()], -1).numpy()
-            draw_field(axes, np.concatenate([place[None], rim, place[None]]), color)
+            figures.draw_field(axes, np.concatenate([place[None], rim, place[None]]), color)
         axes.plot(*place, "^", color=color, markersize=9)
-        name_point(axes, place, camera.name, (6, 6), fontsize=10)
+        figures.name_point(axes, place, camera.name, (6, 6), fontsize=10)
     feet = torch.zeros(len(located.positions), 3) if located.feet is None else located.feet
     for position, foot in zip(located.positions, feet.numpy() / 1e3, strict=True):
         if position.enu is not None and position.covariance is not None:
             center, spread = torch.tensor(position.enu).double(), torch.tensor(position.covariance).double()
             ring = region_outline(center, spread, plain=True) / 1e3
-            axes.fill(ring[:, 0], ring[:, 1], facecolor="none", edgecolor=INK, linewidth=1.2)
-            axes.plot(*center[:2] / 1e3, ".", color=INK, markersize=4)
-            name_point(axes, center[:2] / 1e3, position.name, (5, -11), fontsize=8.5)
+            axes.fill(ring[:, 0], ring[:, 1], facecolor="none", edgecolor=figures.INK, linewidth=1.2)
+            axes.plot(*center[:2] / 1e3, ".", color=figures.INK, markersize=4)
+            figures.name_point(axes, center[:2] / 1e3, position.name, (5, -11), fontsize=8.5)
         elif position.azimuth_deg is not None and position.status == PositionStatus.BEARING_ONLY:
             way = math.radians(position.azimuth_deg)
             end = foot[:2] + reach * np.array([math.sin(way), math.cos(way)])
-            axes.plot(*np.stack([foot[:2], end], 1), "--", color=GRAY, linewidth=1)
-            name_point(axes, end, position.name, (4, 4), fontsize=8.5, color=GRAY)
+            axes.plot(*np.stack([foot[:2], end], 1), "--", color=figures.GRAY, linewidth=1)
+            figures.name_point(axes, end, position.name, (4, 4), fontsize=8.5, color=figures.GRAY)
     if truth is not None:
-        axes.plot(*(truth[truth.isfinite().all(-1)] / 1e3)[:, :2].T, "+", color=WARN, markersize=8)
+        axes.plot(*(truth[truth.isfinite().all(-1)] / 1e3)[:, :2].T, "+", color=figures.WARN, markersize=8)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel="km east", ylabel="km north")
-    return finished(axes)
+    return figures.finished(axes)
 
 
 # Draw a depth budget: range errors against range, on logarithmic scales.
@@ -390,7 +375,9 @@ def budget_figure(
         labels: source -> text in the legend.
         ax: of yours, to draw into.
     """
-    axes = one_panel(ax, 8.6, 5.7, "Range error by source", ["Solid: outward. Dotted: inward. Dashed: to first order."])
+    axes = figures.one_panel(
+        ax, 8.6, 5.7, "Range error by source", ["Solid: outward. Dotted: inward. Dashed: to first order."]
+    )
     far = distances.numpy()
     for name, error in found.items():
         color = _SOURCE_COLORS.get(name, "#111827")
@@ -405,14 +392,14 @@ def budget_figure(
     axes.set_ylim(max(low, 1e-4), float(far.max()) * 2)
     for axis in (axes.xaxis, axes.yaxis):
         low, high = axis.get_view_interval()
-        axis.set_major_formatter(plain_number)
-        axis.set_minor_formatter(NullFormatter() if high > 10 * low else plain_number)
+        axis.set_major_formatter(figures.plain_number)
+        axis.set_minor_formatter(NullFormatter() if high > 10 * low else figures.plain_number)
     axes.grid(which="major", color="#e5e7eb", linewidth=0.8)
     axes.grid(which="minor", color="#f3f4f6", linewidth=0.5)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=9, loc="upper left")
-    return finished(axes)
+    return figures.finished(axes)
 
 
 # A picture of sites: how well an area is seen and located today, and with the candidates that are worth most.
@@ -449,7 +436,7 @@ def siting_figure(
         names = ", ".join(one.site.name for one in built)
         maps.append((f"With {names}", siting_map(area, [*sites, *(one.site for one in built)], weights)))
     levels = _sigma_levels([found for _, found in maps])
-    figure = framed_figure(7.4 * len(maps) + 1.0, 6.8, notes=_siting_notes(maps[0][1], ranked))
+    figure = figures.framed_figure(7.4 * len(maps) + 1.0, 6.8, notes=_siting_notes(maps[0][1], ranked))
     panels = figure.subplots(1, len(maps), squeeze=False, sharex=True, sharey=True)[0]
     for number, (axes, (title, found)) in enumerate(zip(panels, maps, strict=True)):
         colored = _siting_area(axes, area, found, levels)
@@ -463,7 +450,9 @@ def siting_figure(
     (left, right), (low, high) = panels[0].get_xlim(), panels[0].get_ylim()
     figure.set_figheight(min(7.0 * (high - low) / (right - left), 9.0) + 1.8)
     lengths = FuncFormatter(lambda level, _: length_text(level, digits=2))
-    add_color_bar(colored, panels[-1], "standard deviation of a position on the map", ticks=levels, format=lengths)
+    figures.add_color_bar(
+        colored, panels[-1], "standard deviation of a position on the map", ticks=levels, format=lengths
+    )
     patches = [Patch(color=_SINGLE, label="one site sees it: a bearing only"), Patch(color=_HIDDEN, label="hidden")]
     marks = [axes.plot([], [], "^", color="white", markeredgecolor="black", markersize=9, label="site")[0]]
     if ranked:
@@ -490,7 +479,7 @@ def _sigma_levels(maps: Sequence[SitingMap]) -> list[float]:
     values = np.concatenate([_map_sigma(found).ravel() for found in maps])
     values = values[np.isfinite(values)]
     low, high = np.quantile(values, [0.02, 0.95]) if len(values) else (1.0, 10.0)
-    return round_levels(max(float(low), 1e-3), float(high), least=2)
+    return figures.round_levels(max(float(low), 1e-3), float(high), least=2)
 
 
 def _map_grid(area: Area) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -531,12 +520,12 @@ def _siting_marks(
         x, y = _site_field(axes, area, site)
         color = "white" if number < len(sites) else _NEW
         axes.plot([x], [y], "^", color=color, markeredgecolor="black", markersize=9, zorder=5)
-        name_point(axes, (x, y), site.name, (7, 9), zorder=6)
+        figures.name_point(axes, (x, y), site.name, (7, 9), zorder=6)
     for rank, one in enumerate(ranked, start=1):
         x, y = _site_place(area, one.site)
         axes.plot([x], [y], "o", color=_NEW, markeredgecolor="black", markersize=13, zorder=5)
         axes.text(x, y, str(rank), ha="center", va="center", fontsize=8, zorder=6)
-        name_point(axes, (x, y), one.site.name, (9, -8), fontsize=8, zorder=6)
+        figures.name_point(axes, (x, y), one.site.name, (9, -8), fontsize=8, zorder=6)
 
 
 def _site_place(area: Area, site: Site) -> tuple[float, float]:
@@ -587,17 +576,17 @@ def save_site_sketch(path: str | Path, image: NDArray[np.uint8], landmarks: Name
         targets: the same of what is to be located.
     """
     height, width = image.shape[:2]
-    figure = new_figure(width / 160, height / 160, 100)
+    figure = figures.new_figure(width / 160, height / 160, 100)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.imshow(image)
     axes.set_axis_off()
-    for (names, pixels), color in ((landmarks, ACCENT), (targets, WARN)):
+    for (names, pixels), color in ((landmarks, figures.ACCENT), (targets, figures.WARN)):
         for name, (u, v) in zip(names, pixels, strict=True):
             axes.plot(u, v, "o", mfc="none", mec=color, ms=9)
             axes.annotate(
-                name, (u, v), (4, 14), textcoords="offset points", color=color, fontsize=11, path_effects=HALO,
+                name, (u, v), (4, 14), textcoords="offset points", color=color, fontsize=11, path_effects=figures.HALO,
                 rotation=55, arrowprops={"arrowstyle": "-", "color": color, "lw": 0.8},
             )  # fmt: skip
     where = 0.01 * width, 0.97 * height
-    axes.text(*where, "blue: surveyed landmarks    red: targets to locate", fontsize=12, path_effects=HALO)
-    return save_picture(path, figure)
+    axes.text(*where, "blue: surveyed landmarks    red: targets to locate", fontsize=12, path_effects=figures.HALO)
+    return figures.save_picture(path, figure)

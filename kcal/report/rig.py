@@ -14,31 +14,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
+import kcal.report.figures as figures
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
 from kcal.locate.tabulate import middle_row_ends
-from kcal.report.figures import (
-    ACCENT,
-    CAMERA_COLORS,
-    FAINT,
-    GRAY,
-    INK,
-    WARN,
-    RangeScale,
-    draw_arrows,
-    draw_field,
-    draw_north,
-    draw_way,
-    field_outline,
-    finished,
-    frame_image,
-    framed_figure,
-    image_panel,
-    name_point,
-    shortened,
-    whole,
-)
 from kcal.skyline.attitude import SkylineAttitude
 from kcal.texts import length_text, measured_length, range_text
 from kcal.threads import in_one_thread
@@ -97,12 +77,12 @@ def rig_figure(result: RigResult, narrow: bool = False, figure: Figure | SubFigu
         size = f"baseline {measured_length(float(apart[0, 1]), result.sigma_baseline)}"
     title = f"Rig of {len(result.names)} cameras, {size}"
     width, height, dpi = (4.4, 8.4, 160) if narrow else (13.0, 7.0, 130)
-    figure = framed_figure(width, height, title, _notes(result), dpi, figure)
+    figure = figures.framed_figure(width, height, title, _notes(result), dpi, figure)
     parts = figure.subfigures(2, 1) if narrow else figure.subfigures(1, 2, width_ratios=[1.25, 1.0])
     plan, bars = (part.subplots() for part in np.asarray(parts))
     _draw_plan(plan, result, 2 if narrow else 4)
     _draw_items(bars, result)
-    return whole(figure)
+    return figures.whole(figure)
 
 
 def _flat(result: RigResult, points: Array) -> Array:
@@ -130,36 +110,38 @@ def _draw_plan(axes: Axes, result: RigResult, columns: int) -> None:
     reach = max(float(np.max(span)) for span in spans) * 1.15
     nearest = min((float(np.min(span)) for span in spans[1:]), default=reach)
     # Stations around what they see are drawn to scale.
-    scale = RangeScale(nearest=nearest, rim=reach, middle=middle, true=float(np.max(spans[0])) > _WIDE * reach)
+    scale = figures.RangeScale(nearest=nearest, rim=reach, middle=middle, true=float(np.max(spans[0])) > _WIDE * reach)
     extent = []
     for c, camera in enumerate(result.cameras):
-        color, edges = CAMERA_COLORS[c % len(CAMERA_COLORS)], _edges(result, c, camera)
+        color, edges = figures.CAMERA_COLORS[c % len(figures.CAMERA_COLORS)], _edges(result, c, camera)
         if edges is not None:
-            extent.append(scale.place(field_outline(centers[c], *edges, reach, 100)))
-            draw_field(axes, extent[-1], color)
+            extent.append(scale.place(figures.field_outline(centers[c], *edges, reach, 100)))
+            figures.draw_field(axes, extent[-1], color)
     circle = np.linspace(0.0, 2.0 * math.pi, 200)
     for radius in (step * 10.0**power for power in range(-3, 7) for step in (1.0, 5.0)):
         if nearest / 4 <= radius <= reach:
             ring = float(scale.radius(radius))
-            axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=FAINT, linewidth=0.7, linestyle=":")
-            name_point(axes, (0.0, ring), range_text(radius), (0, 1), color=GRAY, ha="center", va="bottom", fontsize=8)
+            axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=figures.FAINT, linewidth=0.7, linestyle=":")
+            figures.name_point(
+                axes, (0.0, ring), range_text(radius), (0, 1), color=figures.GRAY, ha="center", va="bottom", fontsize=8
+            )
     for kind, (points, names, used) in places.items():
         drawn, good = scale.place(points), np.array(used)
         marker = {"landmarks": "^", "boards": "s", "features": "o"}[kind]
         axes.plot(*drawn[good].T, marker, label=kind, markersize=6, color=_COLORS[kind], markerfacecolor="white")
-        axes.plot(*drawn[~good].T, "x", color=WARN, markersize=8, markeredgewidth=1.8)
+        axes.plot(*drawn[~good].T, "x", color=figures.WARN, markersize=8, markeredgewidth=1.8)
         for xy, name, fine in zip(drawn, names, used, strict=True):
             if not fine or (kind == "landmarks" and len(names) <= 30):
-                name_point(axes, xy, name, fontsize=8, color=_COLORS[kind] if fine else WARN)
+                figures.name_point(axes, xy, name, fontsize=8, color=_COLORS[kind] if fine else figures.WARN)
     if any(not item.used for item in result.items):
-        axes.plot([], [], "x", color=WARN, markeredgewidth=1.8, label="left out")
+        axes.plot([], [], "x", color=figures.WARN, markeredgewidth=1.8, label="left out")
     looks = result.rotation[:, 2].numpy()
     for c, name in enumerate(result.names):
         here = scale.place(centers[c])
         ahead = _flat(result, looks[c])
         ahead = ahead / max(float(np.hypot(*ahead)), 1e-9)
-        draw_way(axes, here, here + 0.12 * ahead, INK, linewidth=1.2)
-        color = CAMERA_COLORS[c % len(CAMERA_COLORS)]
+        figures.draw_way(axes, here, here + 0.12 * ahead, figures.INK, linewidth=1.2)
+        color = figures.CAMERA_COLORS[c % len(figures.CAMERA_COLORS)]
         axes.plot(*here, "o", color=color, markersize=6, zorder=9, label=f"{name} camera")
     seen = np.concatenate([scale.place(centers), *extent, *(scale.place(points) for points, _, _ in places.values())])
     low, high = seen.min(0) - 0.1, seen.max(0) + 0.15
@@ -167,7 +149,7 @@ def _draw_plan(axes: Axes, result: RigResult, columns: int) -> None:
     axes.axis("off")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.005), ncols=columns, fontsize=9, frameon=False)
     if result.absolute:
-        draw_north(axes, 0.04)
+        figures.draw_north(axes, 0.04)
     where = "north up" if result.absolute else "first camera's axis up"
     ranges = "to scale" if scale.true else "ranges on a logarithmic scale"
     axes.set_title(f"From above, {where}, {ranges}", fontsize=9)
@@ -194,10 +176,10 @@ def _draw_items(axes: Axes, result: RigResult) -> None:
     limit = max([3.5, *(min(item.sigmas, 8.0) for item in items)]) * 1.05
     for row, item in enumerate(items):
         length = min(item.sigmas, limit)
-        axes.barh(row, length, color=_COLORS[item.source] if item.used else WARN, height=0.7, alpha=0.85)
+        axes.barh(row, length, color=_COLORS[item.source] if item.used else figures.WARN, height=0.7, alpha=0.85)
         if item.sigmas > limit:
             axes.text(limit * 0.99, row, f"{item.sigmas:.0f} ▸", ha="right", va="center", fontsize=7.5, color="white")
-    axes.axvline(1.0, color=INK, linewidth=0.9, linestyle=(0, (4, 3)))
+    axes.axvline(1.0, color=figures.INK, linewidth=0.9, linestyle=(0, (4, 3)))
     axes.set_yticks(range(len(items)), [_label(item) for item in items], fontsize=7 if len(items) > 25 else 8.5)
     axes.set(xlim=(0, limit), ylim=(len(items) - 0.4, -0.6), xlabel="residual in sigmas; 1 is typical")
     axes.spines[["top", "right", "left"]].set_visible(False)
@@ -207,7 +189,7 @@ def _draw_items(axes: Axes, result: RigResult) -> None:
 
 
 def _label(item: ItemResidual) -> str:
-    return dataclasses.replace(item, name=shortened(item.name, 28)).label
+    return dataclasses.replace(item, name=figures.shortened(item.name, 28)).label
 
 
 def _notes(result: RigResult) -> list[str]:
@@ -251,19 +233,23 @@ def stars_figure(
     """
     height, width = image.shape
     known = np.array([bool(name) for name in names], bool)
-    axes = image_panel(ax, (width, height), title, ["Arrows: residuals, modeled minus seen."])
+    axes = figures.image_panel(ax, (width, height), title, ["Arrows: residuals, modeled minus seen."])
     # Turned over: stars are dark on a bright sky, so that marks and names can be read.
     axes.imshow(-_above_sky(image), cmap="gray", vmin=-30.0, vmax=2.0, interpolation="nearest")
-    axes.plot(*pixels[~known].T, "x", color=WARN, markersize=4, label=f"{int((~known).sum())} without a name")
-    style: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "color": ACCENT}
+    axes.plot(*pixels[~known].T, "x", color=figures.WARN, markersize=4, label=f"{int((~known).sum())} without a name")
+    style: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "color": figures.ACCENT}
     axes.plot(*pixels[known].T, "o", label=f"{int(known.sum())} named", **style)
     for place, name in [(at, name) for at, name in zip(pixels, names, strict=True) if name][:_MOST_NAMES]:
-        name_point(axes, place, name, (7 if place[0] < _NEAR_EDGE * width else -7, -3), fontsize=7, va="baseline")
+        figures.name_point(
+            axes, place, name, (7 if place[0] < _NEAR_EDGE * width else -7, -3), fontsize=7, va="baseline"
+        )
     if known.any():
         longest = max(float(np.linalg.norm(residual[known], axis=1).max()), 1e-3)
-        draw_arrows(axes, pixels[known], residual[known], 0.04 * width / longest, color=WARN, width=0.0015)
+        figures.draw_arrows(
+            axes, pixels[known], residual[known], 0.04 * width / longest, color=figures.WARN, width=0.0015
+        )
     axes.legend(loc="lower right", fontsize=8)
-    return finished(axes)
+    return figures.finished(axes)
 
 
 def _above_sky(image: NDArray[Any]) -> NDArray[np.float64]:
@@ -302,27 +288,29 @@ def skyline_figure(images: Sequence[tuple[str, NDArray[Any]]], found: Sequence[S
     bands = [_band(image.shape[0], one) for (_, image), one in shown]
     sizes = [8.3 * (high - low) / image.shape[1] for ((_, image), _), (low, high) in zip(shown, bands, strict=True)]
     ratios = [height for size in sizes for height in (size, 1.1)]
-    figure = framed_figure(9.0, sum(sizes) + 2.3 * len(shown))
+    figure = figures.framed_figure(9.0, sum(sizes) + 2.3 * len(shown))
     panels = figure.subplots(2 * len(shown), 1, height_ratios=ratios, squeeze=False)[:, 0]
     for k, (((name, image), one), (low, high)) in enumerate(zip(shown, bands, strict=True)):
         axes, below = panels[2 * k : 2 * k + 2]
         column, width = np.arange(image.shape[1]), image.shape[1]
         axes.imshow(image, cmap="gray", interpolation="nearest")
-        frame_image(axes, (width, image.shape[0]))
+        figures.frame_image(axes, (width, image.shape[0]))
         axes.set(ylim=(high - 0.5, low - 0.5), xlabel="")
-        axes.plot(column, one.expected, color=ACCENT, linewidth=1.0, label="raster")
+        axes.plot(column, one.expected, color=figures.ACCENT, linewidth=1.0, label="raster")
         left_out = one.border.clear & ~one.used
-        axes.plot(column[left_out], one.border.row[left_out], ".", color=WARN, markersize=2, label="image, left out")
+        axes.plot(
+            column[left_out], one.border.row[left_out], ".", color=figures.WARN, markersize=2, label="image, left out"
+        )
         axes.legend(loc="lower right", fontsize=7)
         angles = zip(
             ("heading", "pitch", "roll"), (one.heading_deg, one.pitch_deg, one.roll_deg), one.sigma_deg, strict=True
         )
         text = ", ".join(f"{angle} {value:.3f} ± {sigma:.3f}°" for angle, value, sigma in angles)
-        axes.set_title(f"{name}: {text}", fontsize=9, color=INK, loc="left")
+        axes.set_title(f"{name}: {text}", fontsize=9, color=figures.INK, loc="left")
         off = one.expected - one.border.row
-        for part, color in ((one.used, ACCENT), (left_out, WARN)):
+        for part, color in ((one.used, figures.ACCENT), (left_out, figures.WARN)):
             below.plot(column, np.where(part, off, np.nan), ".", color=color, markersize=2)
-        below.axhline(0.0, color=INK, linewidth=0.5)
+        below.axhline(0.0, color=figures.INK, linewidth=0.5)
         most = float(np.nanquantile(np.abs(off[one.used]), 0.99)) * 1.6
         below.set(xlim=(-0.5, width - 0.5), ylim=(-most, most))
         below.set_xlabel("u, pixels", fontsize=7)
@@ -364,16 +352,22 @@ def attitude_figure(
     span = float(time[-1] - time[0]) if len(time) else 0.0
     unit, word = next((unit, word) for least, unit, word in _SPANS if span >= least)
     along = (time - (time[0] if len(time) else 0.0)) / unit
-    figure = framed_figure(9.0, 6.3, title)
+    figure = figures.framed_figure(9.0, 6.3, title)
     panels = figure.subplots(3, 1, sharex=True)
     for axes, name, middle, wide in zip(panels, _ANGLES, angle.T, 1.96 * sigma.T, strict=True):
-        axes.fill_between(along, middle - wide, middle + wide, color=ACCENT, alpha=0.25, linewidth=0, label="95 %")
-        axes.plot(along, middle, color=ACCENT, linewidth=1.0)
+        axes.fill_between(
+            along, middle - wide, middle + wide, color=figures.ACCENT, alpha=0.25, linewidth=0, label="95 %"
+        )
+        axes.plot(along, middle, color=figures.ACCENT, linewidth=1.0)
         for sign in (-1.0, 1.0):
-            axes.axhline(sign * limit, color=WARN, linewidth=0.8, linestyle="--", label="limit" if sign > 0 else None)
+            axes.axhline(
+                sign * limit, color=figures.WARN, linewidth=0.8, linestyle="--", label="limit" if sign > 0 else None
+            )
         if not seen.all():
             low = axes.get_ylim()[0]
-            axes.plot(along[~seen], np.full(int((~seen).sum()), low), "|", color=INK, markersize=6, label="not seen")
+            axes.plot(
+                along[~seen], np.full(int((~seen).sum()), low), "|", color=figures.INK, markersize=6, label="not seen"
+            )
             axes.set_ylim(bottom=low)
         axes.set_ylabel(f"{name}, degrees")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", fontsize=8, ncols=3, frameon=False)

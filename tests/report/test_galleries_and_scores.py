@@ -109,7 +109,7 @@ class TestGallery:
 
 def test_a_sketch_names_what_to_mark(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     kept: list[Any] = []
-    monkeypatch.setattr(positions, "save_picture", lambda path, figure: kept.append(figure) or path)
+    monkeypatch.setattr("kcal.report.figures.save_picture", lambda path, figure: kept.append(figure) or path)
     image = np.zeros((320, 640, 3), np.uint8)
     marks = ["post", "roof"], np.array([[100.0, 50.0], [300.0, 80.0]])
     positions.save_site_sketch(tmp_path / "a.png", image, marks, (["ship"], np.array([[500.0, 200.0]])))
