@@ -24,7 +24,7 @@ from kcal.io.rig_file import RigFile
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Rig
-from kcal.texts import counted_text, number_text
+from kcal.texts import number_text
 
 BOARD = Board(columns=7, rows=6, square=0.05)
 SIZE = (640, 480)
@@ -194,14 +194,6 @@ class TestCalibrate:
         assert text.startswith("error: odd.json: ")
         assert message in text
 
-    @pytest.mark.parametrize("count", [0, 1, 2])
-    def test_too_few_views(self, folder: Path, command: Command, count: int) -> None:
-        observations(0, count).save(folder / "few.obs.json")
-        text = command.refuses("calibrate few.obs.json -o a.json")
-        assert (
-            "no view with a board" if count == 0 else f"{counted_text(count, 'view')} of the board: at least 3"
-        ) in text
-
     def test_an_old_file_survives_a_failure(self, folder: Path, command: Command) -> None:
         (folder / "old.json").write_text("precious")
         observations(0, 2).save(folder / "few.obs.json")
@@ -369,15 +361,6 @@ class TestRig:
         (folder / "right.obs.json").write_text(json.dumps(content))
         text = command.refuses("rig left.camera.json right.camera.json", PAIRS, "-o r.json")
         assert "give a CSV of pairs" in text
-
-
-@pytest.mark.parametrize("command", ["calibrate", "rig"])
-def test_help_shows_examples(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    outcome = CliRunner().invoke(app, [command, "--help"])
-    assert outcome.exit_code == 0
-    assert "Examples" in outcome.output
-    assert outcome.output.count(f"kcal {command} left.") >= 2
 
 
 @pytest.mark.parametrize("arguments", [["calibrate"], ["calibrate", "a.json"], ["rig", "a.json", "b.json", "-o", "c"]])

@@ -28,7 +28,6 @@ from kcal.corners.board import Board
 from kcal.corners.observations import Observations, View
 from kcal.errors import DegenerateError
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
-from kcal.io.images import write_png
 from kcal.io.rig_file import RigFile
 from kcal.lens.calibration import CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
@@ -257,35 +256,6 @@ def observations(count: int, *, tilt: float, size: tuple[int, int] = (640, 480))
 
 
 class TestBadInput:
-    def test_empty_folder(self, run: Run) -> None:
-        Path("empty").mkdir()
-        refused(run("detect", "empty", "--board", "9x6", "--square", "25mm", "-o", "a.obs.json"), "empty")
-        assert not Path("a.obs.json").exists()
-
-    def test_no_board_in_any_image(self, run: Run) -> None:
-        gray = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
-        write_png("a.png", gray)
-        refused(run("detect", "a.png", "--board", "9x6", "--square", "25mm", "-o", "a.obs.json"), "a.png", "no board")
-        assert not Path("a.obs.json").exists()
-
-    def test_length_without_unit(self, run: Run) -> None:
-        write_png("a.png", np.zeros((240, 320), dtype=np.uint8))
-        refused(run("detect", "a.png", "--board", "9x6", "--square", "25", "-o", "a.obs.json"), "unit", "25mm")
-
-    def test_two_image_sizes(self, run: Run) -> None:
-        generator = np.random.default_rng(0)
-        for name, shape in (("a.png", (240, 320)), ("b.png", (480, 600))):
-            write_png(name, generator.integers(0, 255, shape, dtype=np.uint8))
-        answer = run("detect", "a.png", "b.png", "--board", "9x6", "--square", "25mm", "-o", "a.obs.json")
-        refused(answer, "320x240", "600x480")
-
-    def test_a_rig_file_where_a_camera_file_belongs(self, run: Run) -> None:
-        Path("rig.json").write_text('{"kcal": "rig", "version": 1}')
-        observations(4, tilt=0.5).save("a.obs.json")
-        answer = run("rig", "rig.json", "rig.json", "--pairs", "a.obs.json", "a.obs.json", "-o", "out.json")
-        refused(answer, "rig.json", "rig file", "camera file is needed")
-        assert not Path("out.json").exists()
-
     def test_output_over_an_input(self, run: Run) -> None:
         observations(5, tilt=0.5).save("a.obs.json")
         before = Path("a.obs.json").read_bytes()

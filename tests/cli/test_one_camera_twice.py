@@ -47,9 +47,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             for k, (u, v) in enumerate(row)
         ]
         (tmp_path / f"long-{name}.csv").write_text("\n".join(["name,camera,u,v", *lines]) + "\n")
-        same = pixels[:, [0, 0]] + NOISE * normal(pixels.shape, 4)
-        lines = [f"p{i}," + ",".join(f"{x:.3f}" for x in row) for i, row in enumerate(same.flatten(1).tolist())]
-        (tmp_path / f"same-{name}.csv").write_text("\n".join(["name,left_u,left_v,right_u,right_v", *lines]) + "\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     return tmp_path
@@ -70,8 +67,3 @@ def test_a_file_given_twice_is_one_camera_at_two_places(folder: Path, command: C
     assert row["status"] == "ok"
     low, high = float(row["range_low_m"]), float(row["range_high_m"])
     assert low < float((TARGET - CENTER[0]).norm()) < high < 1.2 * low
-
-
-def test_one_view_given_twice_is_refused(folder: Path, command: Command) -> None:
-    text = command.refuses("rig mast.camera.json mast.camera.json --marks same-marks.csv", SURVEYED)
-    assert "left and right are one camera at one place" in text

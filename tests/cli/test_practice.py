@@ -216,7 +216,7 @@ def test_options_that_exclude_each_other(tmp_path: Path) -> None:
 def test_the_walk_of_a_stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All commands of README.txt; marks are made from the truth with 0.3 px of noise, in the session of `kcal mark`."""
     folder = tmp_path / "site"
-    practice_site(folder, 1, views=12, frames=40, scale=0.5)
+    practice_site(folder, 1, views=8, frames=24, scale=0.5)
     monkeypatch.chdir(folder)
     readme = Path("README.txt").read_text()
     for step in STEPS:

@@ -54,23 +54,6 @@ def shots(tmp_path):
     return folder
 
 
-def test_all_real_images_are_found(tmp_path):
-    data = os.environ.get("KCAL_DATA")
-    if not data:
-        pytest.skip("KCAL_DATA is not set: no real images")
-    for side in ("left", "right"):
-        output = tmp_path / f"{side}.obs.json"
-        images = Path(data, "opencv_stereo", f"{side}*.jpg")
-        result = kcal("detect", images, "--board", "9x6", "--square", "25mm", "-o", output)
-        assert result.exit_code == 0
-        assert "board found in 13 of 13 images of 640x480 px" in result.output
-        seen = Observations.load(output)
-        assert len(seen.views) == 13
-        assert seen.failures == ()
-        assert seen.board == Board(columns=9, rows=6, square=0.025)
-        assert seen.names[0] == f"{side}01.jpg"
-
-
 def test_failures_are_listed_on_screen_and_in_the_file(shots, tmp_path):
     (shots / "bad.jpg").write_bytes(cv2.imencode(".jpg", cv2.imread(f"{shots}/shot0.png", 0))[1].tobytes()[:1500])
     output = tmp_path / "x.obs.json"

@@ -12,7 +12,6 @@ from lenses import FEW_MODES, HYBRID, KINDS, hybrid_camera, parameters, strong
 from torch import Tensor
 from torch.autograd import gradgradcheck
 from torch.func import functional_call
-from whole_graphs import traced_whole
 
 from kcal import Camera, InputError
 from kcal.lens import LensModel, bake
@@ -547,15 +546,6 @@ class TestPointDerivatives:
         assert distance((reverse * step).sum(-1), slope.sum(-1)) < 1e-9 * float(slope.abs().max())
         mapped = torch.func.vmap(lambda p: camera.project(p)[0])(torch.stack([points, points]))
         assert distance(mapped[1], plain) < 1e-9
-
-    @traced_whole
-    def test_compiled(self) -> None:
-        camera = hybrid_camera("webcam", modes=FEW_MODES)
-        points = random_points(camera, count=FEWEST)
-        plain, _ = camera.project(points)
-        pixels, valid = torch.compile(camera, fullgraph=True, backend="eager")(points)
-        assert bool(valid.all())
-        assert distance(pixels, plain) < 1e-9
 
 
 class TestPolynomials:

@@ -217,17 +217,6 @@ class TestModule:
             ["_extra_state", *(f"{which}.{name}" for which in ("camera", "new_camera") for name in LITTLE.state_dict())]
         )
 
-    def test_compiled_and_exported(self) -> None:
-        undistort = Undistort(LITTLE)
-        image = torch.rand(2, 1, 120, 160)
-        expected, mask = undistort(image)
-        program = torch.export.export(undistort, (image,))
-        out, seen = program.module()(image)
-        assert torch.equal(out, expected)
-        assert torch.equal(seen, mask)
-        compiled = torch.compile(undistort, backend="eager", fullgraph=True)
-        assert torch.equal(compiled(image)[0], expected)
-
     @pytest.mark.parametrize(
         ("image", "message"),
         [

@@ -6,7 +6,6 @@ import pytest
 import torch
 from kornia.geometry.subpix import spatial_soft_argmax2d
 from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turned
-from whole_graphs import traced_whole
 
 from kcal import Camera, DegenerateError, InputError, Origin, PositionStatus, Rig
 from kcal.lens import rotation_from_vector
@@ -328,22 +327,6 @@ def test_sensitivities() -> None:
     module = Localizer(turned_rig, origin=ORIGIN, heading_deg=0.0)
     moved = module(left, right).enu.norm(dim=-1) - tensor(5000.0, 1000.0)
     assert moved.abs().tolist() == pytest.approx([4.3633, 0.17453], rel=2e-3)
-
-
-@traced_whole
-def test_compiles_as_one_graph_with_its_gradients() -> None:
-    module = Localizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)
-    left, right = tensor([980.0, 540.0], [960.0, 540.0], [1.0, 1.0]), tensor([970.0, 540.2], [970.0, 540.0], [1.0, 1.0])
-    cov, mask = 0.04 * torch.eye(4, dtype=torch.float64).repeat(3, 1, 1), torch.tensor([True, True, False])
-    compiled = torch.compile(module, fullgraph=True, backend="eager")
-    gradients = []
-    for call in (module, compiled):
-        marks = left.clone().requires_grad_()
-        found = call(marks, right, cov, mask)
-        gradients.append(torch.autograd.grad(found.enu.sum() + found.inverse_range.sum(), marks)[0])
-        for own, other in zip(module(left, right, cov, mask), found, strict=True):
-            assert torch.allclose(own, other, rtol=1e-9)
-    assert torch.allclose(*gradients, rtol=1e-9)
 
 
 def test_a_detector_is_trained_through_it() -> None:

@@ -156,33 +156,6 @@ def test_gradients_are_exact() -> None:
     assert torch.autograd.gradcheck(places, (pixels, cov), eps=1e-4, rtol=1e-4, atol=1e-3)
 
 
-def mixed_rows() -> tuple[Localizer, Tensor, Tensor]:
-    rig = ring(3, 5000.0)
-    pixels = marks(rig, targets(8)) + noise((8, 3, 2), 0.3)
-    pixels[3, 2, 1] += 80.0
-    seen = torch.ones(8, 3, dtype=torch.bool)
-    seen[0, 1] = False
-    return Localizer(rig, root=rig.with_errors(attitude_deg=0.01)), pixels, seen
-
-
-def test_vmap() -> None:
-    locate, pixels, seen = mixed_rows()
-    plain = locate(pixels, seen)
-    mapped = torch.vmap(lambda pixels, seen: locate(pixels, seen))(pixels[:, None], seen[:, None])
-    assert torch.allclose(mapped.enu[:, 0], plain.enu, atol=1e-6)
-    assert torch.equal(mapped.bad[:, 0], plain.bad)
-    assert plain.bad.nonzero().tolist() == [[3, 2]]
-
-
-@pytest.mark.slow
-def test_export() -> None:
-    locate, pixels, seen = mixed_rows()
-    plain, program = locate(pixels, seen), torch.export.export(locate, (pixels, seen))
-    found = program.module()(pixels, seen)
-    assert torch.allclose(found.enu, plain.enu, atol=1e-3)
-    assert torch.equal(found.bad, plain.bad)
-
-
 def test_one_camera_with_a_stated_height() -> None:
     rig = ring(3, 3000.0)
     points = targets(5)

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lenses import hybrid_camera
 from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turned
-from whole_graphs import traced_whole
 
 from kcal import Camera, DegenerateError, InputError, PositionStatus, Rig
 from kcal.locate import Triangulate
@@ -226,23 +225,6 @@ def test_parallax_and_its_noise_use_the_local_size_of_a_pixel() -> None:
     assert math.asin(1e-3 * result.inverse_range[0].item() / math.hypot(1, 1e-3)) == pytest.approx(
         math.atan(1e-3), rel=1e-9
     )
-
-
-class ClosedForm(Camera):
-    """A pinhole whose inverse needs no iterations, so that tracing it takes no time."""
-
-    def normalize(self, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return (pixels - self.center) / self.focal, torch.isfinite(pixels).all(-1)
-
-
-@traced_whole
-def test_compiles_as_one_graph() -> None:
-    camera = ClosedForm.build(focal=(1600, 1600), center=(959.5, 539.5), size=SIZE, model="pinhole")
-    triangulate = Triangulate(Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])))
-    left, right = tensor([980.0, 540.0], [960.0, 540.0]), tensor([970.0, 540.0], [970.0, 540.0])
-    compiled = torch.compile(triangulate, fullgraph=True, backend="eager")
-    for a, b in zip(triangulate(left, right), compiled(left, right), strict=True):
-        assert torch.allclose(a, b, rtol=1e-9)
 
 
 def test_ranges_do_not_hang_on_the_length_of_the_direction() -> None:

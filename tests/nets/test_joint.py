@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcal import Camera, DegenerateError, InputError
 from kcal.lens.projection import from_pixels, plane_from_points
-from kcal.nets.inverse import InverseNet, initial_weights, train_inverse
+from kcal.nets.inverse import InverseNet, train_inverse
 from kcal.nets.joint import JointFit, JointOptions, ResidualNet, _JointProblem, train_jointly
 from kcal.solve import SolverStatus
 from kcal.solve.lm import LMOptions, minimize
@@ -213,16 +213,6 @@ def test_residual_net_refuses_bad_input() -> None:
         ResidualNet(Camera(start.params.expand(2, -1), size=start.size, model=start.model))
     with pytest.raises(InputError, match="distortion vector"):
         ResidualNet(Camera.build(focal=(100, 100), center=(50, 50), size=(100, 100), model="pinhole"))
-
-
-def test_state_and_precision() -> None:
-    start = start_of()
-    residual, other = ResidualNet(start), ResidualNet(start, seed=1)
-    residual.weights.copy_(random_weights(residual, 4))
-    other.load_state_dict(residual.state_dict())
-    assert torch.equal(other.half()(), residual())
-    assert torch.equal(residual.weights, other.weights)
-    assert residual.weights.numel() == len(initial_weights(residual.widths))
 
 
 # The pure network lens: what it computes, its derivatives, and that Levenberg-Marquardt fits it.

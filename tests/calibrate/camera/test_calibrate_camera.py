@@ -317,11 +317,6 @@ class TestDegenerate:
         with pytest.raises((InputError, DegenerateError)):
             solve(pixels)
 
-    def test_unknown_model(self) -> None:
-        truth = camera()
-        with pytest.raises(InputError, match=r"unknown lens model 'opencv6'; choose one of pinhole, .*ext24"):
-            solve(pixels_of(truth, motions(truth, 3, 1)), "opencv6")
-
 
 class TestWarnings:
     def test_one_bad_view_is_named(self) -> None:
