@@ -17,6 +17,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.dispatch import is_differentiated
+from kcal.errors import InputError
+
 # Singular values of scaled rows below this share of the largest are rounding, not information.
 _ROUNDING = 1e-13
 
@@ -182,6 +185,17 @@ def triangular(rows: Tensor) -> Tensor:
     missing = max(0, rows.shape[1] - len(rows))
     padded = torch.cat([rows, rows.new_zeros(missing, rows.shape[1])])
     return torch.linalg.qr(padded, mode="r")[1]
+
+
+def half_of_covariance(matrix: Tensor) -> Tensor:
+    """(K, P) with halfᵀ half = matrix (P, P), K being its rank."""
+    if is_differentiated(matrix):
+        raise InputError("the root of a covariance has no derivatives; give RigCovariance(half=...)")
+    scale = matrix.diagonal().sqrt()
+    safe = torch.where(scale > 0, scale, 1.0)
+    values, vectors = torch.linalg.eigh(matrix / safe[:, None] / safe[None, :])
+    kept = values > 1e-14 * values[-1:].sum().clamp_min(1e-300)
+    return (scale[:, None] * vectors[:, kept] * values[kept].sqrt()).T
 
 
 def unit_scale(rows: Tensor) -> Tensor:

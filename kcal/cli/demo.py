@@ -201,7 +201,7 @@ def real_pairs(
     command = locate_again(output, f"--site={where.lat},{where.lon},{where.height}", f"--heading={heading}")
     marks = kcal.locate.read_marks(output / "points.csv")
     rig = rooms.load_pair(output / "rig.json")
-    located = kcal.locate_points(kcal.Localizer(rig, origin=where, heading_deg=heading), marks)
+    located = kcal.locate_points(kcal.Localizer(rig.placed(origin=where, heading_deg=heading)), marks)
     out.print("\nThe board's diagonal, true against estimated")
     rows = rooms.diagonal_rows(located, board)
     print_table(rows)

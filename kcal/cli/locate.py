@@ -133,7 +133,7 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[rooms.Point
     """
     solved = kcal.load_rig(rig)
     stated = own.height is not None or own.terrain is not None
-    many = stated or rooms.is_long(points) or len(solved) != 2 or not solved.in_first_frame
+    many = stated or rooms.is_long(points) or not solved.is_pair
     if many:
         refuse_of_pairs(own)
     elif own.aged is not None and own.history is not None:
@@ -153,9 +153,6 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[rooms.Point
         if own.history is not None:
             # Loads OpenCV and SciPy, which nothing else here needs.
 
-            if solved.covariance is None:
-                # Not exact: moments add what is not known of them.
-                solved.covariance = kcal.rig.RigCovariance.of(solved)
             by_moments = rooms.located_at(
                 own.history, solved, lambda rig: rooms.PointLocator(localize(rig), geoid=geoid)
             )
@@ -201,15 +198,16 @@ def pair_localizer(solved: kcal.Rig, own: LocateOptions, noise: float) -> Callab
     refraction, refraction_sigma = own.refraction or (None, None)
 
     def localize(standing: kcal.Rig) -> kcal.Localizer:
-        errors = rooms.run_errors(
+        if site or heading or own.pitch or own.roll or own.refraction:
+            standing = standing.placed(
+                origin=None if site is None else site.origin, heading_deg=azimuth, pitch_deg=own.pitch,
+                roll_deg=own.roll, refraction=refraction, refraction_sigma=refraction_sigma,
+            )  # fmt: skip
+        standing = rooms.with_stated_errors(
             standing, yaw_deg=yaw_sigma, heading_deg=heading.sigma or 0.0 if heading else 0.0,
-            origin_m=site.sigma or 0.0 if site else 0.0, elsewhere=site is not None,
+            origin_m=site.sigma or 0.0 if site else 0.0,
         )  # fmt: skip
-        return kcal.Localizer(
-            standing, weights="marks", origin=None if site is None else site.origin, heading_deg=azimuth,
-            pitch_deg=own.pitch, roll_deg=own.roll, pixel_sigma=noise, calibration=errors.calibration,
-            mounting=errors.mounting, link=errors.link, refraction=refraction, refraction_sigma=refraction_sigma,
-        )  # fmt: skip
+        return kcal.Localizer(standing, weights="marks", pixel_sigma=noise)
 
     return localize
 

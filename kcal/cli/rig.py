@@ -78,7 +78,7 @@ def rig_lines(result: rooms.RigResult, rig: kcal.Rig, unpaired: int) -> list[str
             f"ellipsoid (± {length_text(max(sigma[:2]), digits=2)} level, {length_text(sigma[2], digits=2)} up), "
             f"heading {heading}°, pitch {pitch}°, roll {roll}°"
         )
-        if mounting.refraction is not None and result.data.landmarks is not None:
+        if result.data.landmarks is not None:
             lines.append(f"refraction of light {measured_text(mounting.refraction, sigma[6])} of the Earth's curvature")
     return lines
 

@@ -77,7 +77,7 @@ from kcal.locate.export import read_positions as read_positions
 from kcal.locate.marks import is_long as is_long
 from kcal.locate.marks import read_mark_chunks as read_mark_chunks
 from kcal.locate.marks import write_marks as write_marks
-from kcal.locate.mounting import run_errors as run_errors
+from kcal.locate.mounting import with_stated_errors as with_stated_errors
 from kcal.locate.moving import CLOCK as CLOCK
 from kcal.locate.points import PointLocator as PointLocator
 from kcal.locate.points import PositionSample as PositionSample

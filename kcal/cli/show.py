@@ -152,7 +152,7 @@ def view_command(
     """
     solved = _rig_of(rig)
     noise, note = pixel_sigma_and_source(options.pixel_sigma, solved)
-    pair = len(solved) == 2 and solved.in_first_frame and solved.root is None
+    pair = solved.is_pair
     if not pair:
         refuse_of_pairs(options)
     localize = pair_localizer(solved, options, noise)(solved) if pair else kcal.Localizer(solved, pixel_sigma=noise)

@@ -19,12 +19,14 @@ from torch import Tensor, nn
 from kcal.checks import as_covariance, require_root
 from kcal.dispatch import still
 from kcal.errors import FileError, InputError
+from kcal.gaussian import half_of_covariance
 from kcal.io.camera_file import CameraFile, named_camera_file
 from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
+from kcal.lens.pair_errors import by_relative
 from kcal.lens.projection import INTRINSICS
-from kcal.lens.rig import REFRACTION, Mounting, Origin, Rig, RigCovariance
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting, Origin, Rig
 from kcal.native_file import NativeFile, Record, storing
 
 Triple = tuple[float, float, float]
@@ -73,29 +75,13 @@ class RigMounting(FrameOrigin):
         heading_deg: of its axis, clockwise from true north.
         pitch_deg: of its axis, positive up.
         roll_deg: clockwise as seen from behind.
-        covariance: (6, 6) of east, north, up of the center (meters) and of turns about these axes (radians), or (7, 7)
-            with the coefficient of refraction.
-        link: (P, 6) or (P, 7) covariance of the rig's P quantities (`RigFile.half`) with these.
-        refraction: the coefficient, if anything was found of it.
+        refraction: coefficient.
     """
 
     heading_deg: float
     pitch_deg: float = pydantic.Field(ge=-90, le=90)
     roll_deg: float
-    covariance: Matrix | None = None
-    link: Matrix | None = None
-    refraction: float | None = pydantic.Field(default=None, ge=-2, le=2)
-
-    @pydantic.model_validator(mode="after")
-    def _square(self) -> RigMounting:
-        if self.covariance is not None:
-            size = 7 if len(self.covariance) == 7 else 6
-            matrix = _tensor(self.covariance, size, size, "the mounting's covariance")
-            as_covariance("the mounting's covariance", matrix, size)
-            if self.link is not None:
-                _tensor(self.link, len(self.link), size, "the mounting's link")
-        self.mounting()
-        return self
+    refraction: float = pydantic.Field(default=REFRACTION, ge=-2, le=2)
 
     @classmethod
     def of(cls, mounting: Mounting) -> RigMounting:
@@ -103,14 +89,15 @@ class RigMounting(FrameOrigin):
         own = {name: getattr(mounting, name) for name in cls.model_fields if hasattr(mounting, name)}
         return cls(**dataclasses.asdict(mounting.origin), **own)
 
+    @pydantic.model_validator(mode="after")
+    def _possible(self) -> RigMounting:
+        self.mounting()
+        return self
+
     def mounting(self) -> Mounting:
-        """As `Rig.mounting`."""
-        content: dict[str, Any] = dict(self)
-        origin = Origin(**{name: content.pop(name) for name in FrameOrigin.model_fields})
-        for name in ("covariance", "link"):
-            if content[name] is not None:
-                content[name] = torch.tensor(content[name], dtype=torch.float64)
-        return Mounting(origin=origin, **content)
+        """As `Rig.mounting`, exact."""
+        content = dict(self)
+        return Mounting(origin=Origin(**{name: content.pop(name) for name in FrameOrigin.model_fields}), **content)
 
 
 class RigFile(NativeFile):
@@ -122,9 +109,8 @@ class RigFile(NativeFile):
         poses: where they stand in the rig's frame.
         origin: where this frame is anchored on the Earth, east, north, up; None: it is a camera's or any other one.
         refraction: coefficient.
-        root: (K, P) as `Rig.root`.
-        half: (K, P) as in `RigCovariance`, of two cameras: what was held has zeros.
-        mounting: where two cameras stand on the Earth, if that was solved.
+        root: (K, P) as `Rig.root`: what was held has zeros.
+        mounting: where the left one of two cameras stands on the Earth, if that is known.
         calibration: how the rig was solved, if it was.
         summary: what `kcal show` prints of two cameras without computing.
 
@@ -145,7 +131,6 @@ class RigFile(NativeFile):
     origin: FrameOrigin | None = None
     refraction: float = pydantic.Field(default=REFRACTION, ge=-2, le=2)
     root: Packed | None = None
-    half: Packed | None = None
     mounting: RigMounting | None = None
     calibration: RigCalibration | None = None
     summary: RigSummary | None = None
@@ -156,21 +141,11 @@ class RigFile(NativeFile):
             raise ValueError(f"{len(self.names)} names, {len(self.cameras)} cameras and {len(self.poses)} poses")
         if len(set(self.names)) != len(self.names) or not all(self.names):
             raise ValueError(f"unlike names are needed, got {', '.join(self.names)}")
-        if len(self.names) != 2 and not (self.half is None and self.mounting is None):
-            raise ValueError(f"half and mounting are those of two cameras; there are {len(self.names)}")
+        if len(self.names) != 2 and self.mounting is not None:
+            raise ValueError(f"mounting is that of two cameras; there are {len(self.names)}")
         lenses = sum(len(camera.coefficients) + len(INTRINSICS) for camera in self.cameras)
-        sizes = {"half": (self.half, lenses + 6), "root": (self.root, lenses + 6 * len(self.names) + 1)}
-        for word, (value, size) in sizes.items():
-            if value is not None:
-                require_root(word, value.tensor(), size)
-        known, link = self.known(), None if self.mounting is None else self.mounting.link
-        if link is not None:
-            if known is None:
-                raise ValueError("the mounting's link needs the rig's covariance")
-            if self.mounting is None or self.mounting.covariance is None:
-                raise ValueError("the mounting's link needs the mounting's covariance")
-            mounted = torch.tensor(self.mounting.covariance, dtype=torch.float64)
-            known.checked_link(mounted, _tensor(link, lenses + 6, len(mounted), "the mounting's link"))
+        if self.root is not None:
+            require_root("root", self.root.tensor(), lenses + 6 * len(self.names) + 1)
         if (len(self.names) != 2 or self.origin is not None) and all(file.model.complete for file in self.cameras):
             self.rig()
         return self
@@ -181,13 +156,9 @@ class RigFile(NativeFile):
         if isinstance(content, dict) and content.get("kcal") == cls.KIND and content.get("version") in _EARLIER:
             try:
                 content = _EARLIER[content["version"]](content)
-            except InputError as error:
+            except (InputError, ValueError, TypeError) as error:
                 raise FileError(f"{source}: bad rig file: {error}") from error
         return super().parse(content, source)
-
-    def known(self) -> RigCovariance | None:
-        """The stored covariance of two cameras."""
-        return None if self.half is None else RigCovariance(half=self.half.tensor())
 
     def rig(self, field: nn.Module | None = None) -> Rig:
         """The rig, equal to the stored one to the last bit, with all that is known of it; `field` as for `load_rig`."""
@@ -198,11 +169,49 @@ class RigFile(NativeFile):
         )
         origin = None if self.origin is None else Origin(**dict(self.origin))
         rig = Rig(cameras, self.names, rotation, translation, origin=origin, refraction=self.refraction)
-        rig.root = None if self.root is None else self.root.tensor()
-        rig.covariance = self.known()
         rig.mounting = None if self.mounting is None else self.mounting.mounting()
+        rig.root = None if self.root is None else self.root.tensor()
         rig.calibration = self.calibration
         return rig
+
+
+def _joint_errors(size: int, half: Any, stands: dict[str, Any] | None) -> Tensor:
+    """`Rig.relative_root` of what 1.0 wrote of two cameras.
+
+    Args:
+        size: quantities of `RigCovariance`.
+        half: packed root of these.
+        stands: covariance (6, 6) or (7, 7) of the mounting, and link (size, 6) or (size, 7), its covariance with these.
+    """
+    known = torch.zeros(0, size, dtype=torch.float64) if half is None else Packed.model_validate(half).tensor()
+    require_root("half", known, size)
+    joint = torch.nn.functional.pad(known, (0, 7))
+    if stands is None:
+        return joint
+    rows = stands.get("covariance", torch.zeros(6, 6).tolist())
+    count = 7 if len(rows) == 7 else 6
+    mounting = as_covariance(
+        "the mounting's covariance", _tensor(rows, count, count, "the mounting's covariance"), count
+    )
+    if "link" in stands:
+        if half is None or "covariance" not in stands:
+            raise ValueError("the mounting's link needs the covariances of the rig and of the mounting")
+        link = _tensor(stands["link"], size, count, "the mounting's link")
+        whole = torch.cat([torch.cat([known.T @ known, link], 1), torch.cat([link.T, mounting], 1)])
+        as_covariance("covariance of rig and mounting", whole, size + count)
+        # What the mounting owes to the rig's errors: knownᵀ of = link.
+        scale = torch.linalg.vector_norm(known, dim=0)[:, None]
+        unit = torch.where(scale > 0, scale, 1.0)
+        of = torch.linalg.lstsq(known.T / unit, link / unit, driver="gelsd").solution
+        joint[:, size : size + count] = of
+        left_over = mounting - of.T @ of
+        # What the rig's errors explain is zero but for rounding.
+        kept = left_over.diagonal() > 1e-12 * mounting.diagonal()
+        mounting = left_over * (kept[:, None] & kept)
+    own = half_of_covariance(mounting)
+    if count == 6:
+        own = torch.block_diag(own, own.new_full((1, 1), REFRACTION_SIGMA))
+    return torch.cat([joint, torch.nn.functional.pad(own, (size, 0))])
 
 
 def _from_two(content: dict[str, Any]) -> dict[str, Any]:
@@ -225,8 +234,25 @@ def _from_two(content: dict[str, Any]) -> dict[str, Any]:
     more = {name: value for name, value in content.items() if name not in known}
     if more.get("covariance") is None:
         more.pop("covariance", None)
+    half, stands, cameras = more.pop("half", None), more.get("mounting"), [content.get("left"), content.get("right")]
+    owned: dict[str, Any] = {}
+    if isinstance(stands, dict):
+        owned = {name: stands[name] for name in ("covariance", "link") if stands.get(name) is not None}
+        more["mounting"] = {k: v for k, v in stands.items() if k not in ("covariance", "link") and v is not None}
+    try:
+        lenses = sum(len(camera["coefficients"]) + len(INTRINSICS) for camera in cameras)  # type: ignore[index]
+        turn, shift = (torch.tensor(pose[part], dtype=torch.float64) for part in ("rotation", "translation"))
+        center = torch.stack([torch.zeros_like(shift), -turn.T @ shift])
+        look = RigMounting(**more["mounting"]).mounting().enu_from_cam if stands else torch.eye(3, dtype=torch.float64)
+    except (KeyError, TypeError, ValueError, RuntimeError):
+        # What is wrong with it is told by the checks of the fields.
+        pass
+    else:
+        joint = _joint_errors(lenses + 6, half, owned if stands else None)
+        if len(joint):
+            root = joint @ by_relative(lenses, center, turn, look, back=True).T
+            more["root"] = Packed.of(root).model_dump()
     still = {"rotation": torch.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
-    cameras = [content.get("left"), content.get("right")]
     return {
         "version": RigFile.VERSION, "names": ["left", "right"], "cameras": cameras, "poses": [still, pose],
         "calibration": solved, **more,
@@ -270,7 +296,7 @@ def rig_to_file(rig: Rig) -> RigFile:
         (-1.0, 0.0, 0.0)
     """
     rig = still(rig)
-    root, covariance, mounting, origin = rig.root, rig.covariance, rig.mounting, rig.origin
+    root, mounting, origin = rig.root, rig.mounting, rig.origin
     with storing("rig"):
         file = RigFile(
             names=rig.names,
@@ -282,7 +308,6 @@ def rig_to_file(rig: Rig) -> RigFile:
             origin=None if origin is None else FrameOrigin(**dataclasses.asdict(origin)),
             refraction=float(rig.refraction),
             root=None if root is None else Packed.of(root),
-            half=None if covariance is None else Packed.of(covariance.half),
             mounting=None if mounting is None else RigMounting.of(mounting),
             calibration=rig.calibration,
         )

@@ -103,6 +103,43 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
     return flat.reshape(*rotation.shape[:-2], 3)
 
 
+def enu_from_cam(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Tensor:
+    """Rotation that takes camera axes (x right, y down, z forward) to east, north, up.
+
+    Starting from a level camera that looks north, it is turned clockwise (seen from above) by the heading, raised by
+    the pitch about its own x axis, and then rolled about its own optical axis.
+
+    Args:
+        heading_deg: azimuth of the optical axis, degrees clockwise from true north.
+        pitch_deg: elevation of the optical axis above the horizontal plane, degrees, positive up.
+        roll_deg: degrees, positive clockwise as seen from behind the camera: the right side goes down.
+
+    Returns:
+        (3, 3) float64, the columns being the camera's right, down and forward axes in ENU.
+
+    Raises:
+        InputError: an angle that is not finite, a pitch beyond ±90, or a heading or roll beyond ±360.
+
+    Example:
+        >>> enu_from_cam(90.0)[:, 2].round(decimals=12).abs().tolist()
+        [1.0, 0.0, 0.0]
+    """
+    for name, value, limit in (("heading", heading_deg, 360.0), ("pitch", pitch_deg, 90.0), ("roll", roll_deg, 360.0)):
+        if not abs(value) <= limit:
+            raise InputError(f"{name} {value}: degrees between -{limit:g} and {limit:g} are needed")
+    heading, pitch, roll = (math.radians(value) for value in (heading_deg, pitch_deg, roll_deg))
+    east, north = math.sin(heading), math.cos(heading)
+    forward = (east * math.cos(pitch), north * math.cos(pitch), math.sin(pitch))
+    right = (north, -east, 0.0)
+    down = (east * math.sin(pitch), north * math.sin(pitch), -math.cos(pitch))
+    columns = (
+        [r * math.cos(roll) + d * math.sin(roll) for r, d in zip(right, down, strict=True)],
+        [d * math.cos(roll) - r * math.sin(roll) for r, d in zip(right, down, strict=True)],
+        forward,
+    )
+    return torch.tensor(columns, dtype=torch.float64).T
+
+
 def nearest_rotation(matrix: Tensor) -> Tensor:
     """Return the rotations closest to matrices (..., 3, 3) in the Frobenius norm (orthogonal Procrustes).
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import hashlib
 import math
@@ -11,15 +12,17 @@ from typing import Any, Self
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from kcal.checks import StatedModule, as_covariance, as_points, as_tensor, require_root, scalar
-from kcal.dispatch import is_differentiated
 from kcal.doors import shown_in_notebooks
 from kcal.errors import InputError, warn_user
+from kcal.gaussian import half_of_covariance
 from kcal.lens.calibration import RigCalibration, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
-from kcal.lens.pose import Movable, check_motion, rotation_from_vector
+from kcal.lens.pair_errors import RigCovariance, by_relative
+from kcal.lens.pose import Movable, check_motion, enu_from_cam, rotation_from_vector
 from kcal.texts import brief, length_text
 from kcal.values import number_list
 
@@ -106,7 +109,7 @@ def check_refraction(refraction: float, sigma: float) -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Mounting:
-    """How the left camera of a rig stands, how light was refracted when that was found, and how well both are known.
+    """How a camera stands, how light is refracted there, and how well both are known.
 
     Args:
         origin: place of the camera's projection center.
@@ -115,9 +118,7 @@ class Mounting:
         roll_deg: degrees, positive clockwise as seen from behind the camera.
         covariance: (7, 7) of east, north, up (meters), of turns about these axes (radians), all at the camera, and of
             the coefficient of refraction; (6, 6) where nothing was found of the last; None: exact.
-        link: (P, 7) or (P, 6) covariance of the rig's P quantities, in the order of `RigCovariance`, with these; None:
-            independent.
-        refraction: coefficient k, see `Localizer`; None: nothing was found of it.
+        refraction: coefficient k, see `Localizer`.
 
     Example:
         >>> Mounting(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0).pitch_deg
@@ -131,8 +132,12 @@ class Mounting:
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
     covariance: Tensor | None = None
-    link: Tensor | None = None
-    refraction: float | None = None
+    refraction: float = REFRACTION
+
+    @property
+    def enu_from_cam(self) -> Tensor:
+        """(3, 3) rotation of the camera."""
+        return enu_from_cam(self.heading_deg, self.pitch_deg, self.roll_deg)
 
 
 # `Rig`: cameras and where each stands in one frame; `RigCovariance`: how well two of them are known.
@@ -151,10 +156,12 @@ class Rig(Movable, StatedModule):
     What else is known of the rig travels with it and is stored in its file, but takes no part in projection. Each of
     these attributes is None until it is set, and again once a camera or a pose has changed:
 
-    * `covariance` (a `RigCovariance`) and `mounting` (a `Mounting`), of two cameras;
-    * `root`, of any number: (K, P) with rootᵀ root the covariance of P quantities: all parameters of each camera in
-      turn (`Camera.names`); then for each camera its center (3, meters) and a small turn of it (3, radians), both along
-      and about the rig frame's axes; last the coefficient of refraction. None: cameras and poses count as exact;
+    * `root`: (K, P) with rootᵀ root the covariance of P quantities: all parameters of each camera in turn
+      (`Camera.names`); then for each camera its center (3, meters) and a small turn of it (3, radians), both along and
+      about the rig frame's axes; last the coefficient of refraction. None: cameras and poses count as exact;
+    * `mounting` (a `Mounting`): where the left one of two cameras, whose frame is the rig's, stands on the Earth. What
+      is known of that is read from `root`, as `covariance` (a `RigCovariance`) is: that of the lenses and the relative
+      pose. Each of them may be set, and is then independent of what else is known;
     * `calibration` (a `RigCalibration`): how the rig was solved.
 
     Args:
@@ -190,8 +197,7 @@ class Rig(Movable, StatedModule):
 
     refraction: Tensor
     place: Tensor | None
-    covariance = UntilChanged["RigCovariance"](lambda rig, value: value.check(rig))
-    mounting = UntilChanged[Mounting]()
+    _stands = UntilChanged[Mounting]()
     root = UntilChanged[Tensor](lambda rig, value: rig.check_root(value))
     calibration = UntilChanged[RigCalibration]()
 
@@ -335,7 +341,8 @@ class Rig(Movable, StatedModule):
 
     def extra_repr(self) -> str:
         """Names, distance of the cameras, origin, and what else is known, for `repr`."""
-        known = (word for word in ("covariance", "mounting", "root", "calibration") if getattr(self, word) is not None)
+        words = *(("covariance", "mounting") if self.is_pair else ("root",)), "calibration"
+        known = (word for word in words if getattr(self, word) is not None)
         if len(self) == 2:
             apart = f"baseline={length_text(float(self.baseline))}"
         else:
@@ -480,6 +487,140 @@ class Rig(Movable, StatedModule):
         """Raise `InputError` unless `root` has the size of this rig's quantities, and is finite."""
         require_root("root", root, self.quantities)
 
+    @property
+    def relative_root(self) -> Tensor | None:
+        """(K, P) `root` of two cameras in other quantities.
+
+        These are the lenses' and the relative pose in the order of `RigCovariance`, then place and attitude of the left
+        camera and refraction in that of `Mounting.covariance`.
+        """
+        if self.root is None or len(self) != 2:
+            return None
+        by = self._relative().to(self.root)
+        found = self.root @ by.T
+        # A difference that is zero but for rounding is zero.
+        return torch.where(found.abs() > 1e-13 * (self.root.abs() @ by.T.abs()), found, 0.0)
+
+    @relative_root.setter
+    def relative_root(self, value: Tensor) -> None:
+        _of_two(self, "relative_root")
+        require_root("joint covariance", value, self.quantities)
+        self.root = value @ self._relative(back=True).to(value).T
+
+    def _relative(self, *, back: bool = False) -> Tensor:
+        look = torch.eye(3).to(self.center) if self._stands is None else self._stands.enu_from_cam.to(self.center)
+        return by_relative(sum(self.sizes), self.center, self.rotation[1], look, back=back)
+
+    def _take(self, covariance: Tensor | None, stands: Mounting | None, mounting: Tensor | None) -> None:
+        """Set `root` to independent errors (K, P - 7) of lenses and relative pose, and (L, 7) of the mounting."""
+        self._stands = stands
+        size = self.quantities - 7
+        parts = [pad(covariance, (0, 7))] if covariance is not None else []
+        parts += [pad(mounting, (size, 0))] if mounting is not None else []
+        if parts:
+            self.relative_root = torch.cat(parts)
+        else:
+            self.root = None
+
+    @property
+    def known(self) -> bool:
+        """Whether lenses and poses have error bars; where a pair stands says nothing of them."""
+        return (self.covariance if self.is_pair else self.root) is not None
+
+    @property
+    def covariance(self) -> RigCovariance | None:
+        """How well two cameras and their relative pose are known; None: nothing is."""
+        known = self.relative_root
+        half = None if known is None else known[:, :-7]
+        return None if half is None or not bool(half.any()) else RigCovariance(half=half[half.any(1)])
+
+    @covariance.setter
+    def covariance(self, value: RigCovariance | None) -> None:
+        size = _of_two(self, "covariance").quantities - 7
+        if value is not None:
+            require_root("joint covariance", value.half, size)
+        known = self.relative_root
+        mounting = None if known is None else known[:, size:]
+        self._take(None if value is None else value.half, self._stands, mounting)
+
+    @property
+    def mounting(self) -> Mounting | None:
+        """Where the left one of two cameras stands, and how well that is known."""
+        stands, known = self._stands, self.relative_root
+        if stands is None or known is None:
+            return stands
+        return dataclasses.replace(stands, covariance=known[:, -7:].T @ known[:, -7:])
+
+    @mounting.setter
+    def mounting(self, value: Mounting | None) -> None:
+        known, half = self.relative_root, None
+        if value is not None:
+            if not self.is_pair:
+                raise InputError("mounting: two cameras in the left one's frame are needed; others have an origin")
+            check_refraction(value.refraction, 0.0)
+            covariance = torch.zeros(6, 6).double() if value.covariance is None else value.covariance
+            covariance = as_covariance("mounting", covariance, 7 if covariance.shape[-1:] == (7,) else 6)
+            half = half_of_covariance(covariance)
+            if len(covariance) == 6:
+                half = torch.block_diag(half, half.new_full((1, 1), REFRACTION_SIGMA))
+            value = dataclasses.replace(value, covariance=None)
+        self._take(None if known is None else known[:, :-7], value, half)
+
+    def placed(
+        self,
+        *,
+        origin: Origin | None = None,
+        heading_deg: float | None = None,
+        pitch_deg: float = 0.0,
+        roll_deg: float = 0.0,
+        covariance: Tensor | None = None,
+        refraction: float | None = None,
+        refraction_sigma: float | None = None,
+    ) -> Self:
+        """The same two cameras and poses, elsewhere on the Earth or in other light.
+
+        Args:
+            origin: position of the left camera's projection center; with `heading_deg`, or neither: where it stands.
+            heading_deg: of the left camera's axis, clockwise from true north; see `kcal.locate.enu_from_cam`.
+            pitch_deg: of the same axis, positive up.
+            roll_deg: of the left camera, positive clockwise as seen from behind.
+            covariance: of a new place, as in `Mounting`.
+            refraction: coefficient k, see `Localizer`; 0.13 in a new place if left out. For simulations and other
+                straight lines it and its sigma are 0.
+            refraction_sigma: its standard deviation; if left out, as it was known where `refraction` is left out too,
+                and 0.1 otherwise, which suits lines of sight some ten meters above the ground; near hot or cold ground
+                0.5 and more are usual.
+
+        Raises:
+            InputError: half a place, no place at all, or a value that cannot be.
+
+        Example:
+            >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+            >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
+            >>> there = rig.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
+            >>> there.mounting.heading_deg, rig.mounting
+            (35.0, None)
+        """
+        same = copy.copy(self)
+        if (origin is None) != (heading_deg is None) or (origin is None and (pitch_deg or roll_deg)):
+            raise InputError("origin and heading_deg belong together, and pitch_deg and roll_deg to them")
+        if origin is not None and heading_deg is not None:
+            same.mounting = Mounting(
+                origin=origin, heading_deg=heading_deg, pitch_deg=pitch_deg, roll_deg=roll_deg, covariance=covariance
+            )
+        elif self._stands is None or covariance is not None:
+            raise InputError("refraction: this rig does not say where it stands; give origin and heading_deg")
+        if refraction is not None or refraction_sigma is not None:
+            light = REFRACTION if refraction is None else refraction
+            sigma = REFRACTION_SIGMA if refraction_sigma is None else refraction_sigma
+            check_refraction(light, sigma)
+            assert same._stands is not None
+            same._stands = dataclasses.replace(same._stands, refraction=light)
+            known = self.center.new_zeros(0, self.quantities) if same.root is None else same.root
+            alone = pad(known.new_full((1, 1), sigma), (self.quantities - 1, 0))
+            same.root = torch.cat([pad(known[:, :-1], (0, 1)), alone])
+        return same
+
     def with_errors(
         self,
         *,
@@ -532,96 +673,6 @@ def _of_two(rig: Rig, wanted: str) -> Rig:
     return rig
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RigCovariance:
-    """How well a rig is known: one joint covariance, so that what is correlated stays so.
-
-    The order is: the parameters of the left camera as in `Camera.names`, those of the right one, the rotation of
-    right_from_left (3 radians: a rotation vector about the right camera's axes, `exp([ω]x) R`), its translation
-    (3 meters), as in `kcal.lens.pose`.
-
-    Args:
-        half: (K, P) float64, P = the two cameras' parameters + 6: halfᵀ half is the covariance. As a root it loses
-            nothing where coefficients are hardly determined one by one and their sum is.
-
-    Example:
-        >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
-        >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
-        >>> sigma = torch.tensor([0, 1e-4, 0, 0, 0, 0], dtype=torch.float64)  # relative yaw
-        >>> known = RigCovariance.of(rig, pose=torch.diag(sigma**2))
-        >>> tuple(known.half.shape), tuple(known.matrix.shape)
-        ((1, 16), (16, 16))
-    """
-
-    __repr__ = brief
-
-    half: Tensor
-
-    @classmethod
-    def of(
-        cls,
-        rig: Rig,
-        *,
-        left: Tensor | None = None,
-        right: Tensor | None = None,
-        pose: Tensor | None = None,
-        joint: Tensor | None = None,
-    ) -> RigCovariance:
-        """Put parts together, each independent of the others and exact where left out; or take a `joint` matrix.
-
-        Cameras and pose of a rig that was solved are not independent: errors of a lens are undone by the pose for all
-        that was seen. Parts of a joint covariance taken as independent give intervals that are far too wide.
-
-        Args:
-            rig: the rig that they belong to.
-            left: of the left camera's parameters, (5 + P, 5 + P).
-            right: of the right camera's.
-            pose: (6, 6) of the relative pose.
-            joint: all of it, in place of the parts.
-
-        Raises:
-            InputError: a wrong shape, a matrix that is no covariance, or parts and a joint matrix together.
-        """
-        sizes = (rig.left.values.shape[-1], rig.right.values.shape[-1], 6)
-        if joint is not None:
-            if not (left is None and right is None and pose is None):
-                raise InputError("rig covariance: give the joint matrix or its parts, not both")
-            return cls(half=half_of_covariance(as_covariance("joint covariance", joint, sum(sizes))))
-        names = ("left camera's covariance", "right camera's covariance", "pose covariance")
-        parts = [as_covariance(*item) for item in zip(names, (left, right, pose), sizes, strict=True)]
-        return cls(half=torch.block_diag(*map(half_of_covariance, parts)))
-
-    @property
-    def matrix(self) -> Tensor:
-        """(P, P) the covariance."""
-        return self.half.T @ self.half
-
-    def check(self, rig: Rig) -> None:
-        """Raise `InputError` unless it has the size of this rig's quantities, and is finite."""
-        size = rig.left.values.shape[-1] + rig.right.values.shape[-1] + 6
-        require_root("joint covariance", self.half, size)
-
-    def with_pose(self, covariance: Tensor) -> RigCovariance:
-        """This, and an independent error (6, 6) of the relative pose."""
-        more = half_of_covariance(as_covariance("pose covariance", covariance, 6)).to(self.half)
-        zero = more.new_zeros(len(more), self.half.shape[1] - 6)
-        return RigCovariance(half=torch.cat([self.half, torch.cat([zero, more], 1)]))
-
-    def checked_link(self, mounting: Tensor, link: Tensor) -> Tensor:
-        """`link` (P, M) as float64, after checking that it fits this covariance and that of the mounting (M, M).
-
-        Raises:
-            InputError: a wrong shape, or the three together are no covariance.
-        """
-        size, more = self.half.shape[1], len(mounting)
-        if not isinstance(link, Tensor) or tuple(link.shape) != (size, more):
-            raise InputError(f"link: a covariance of the calibration with the mounting, ({size}, {more}), is needed")
-        matrix = self.matrix
-        link, mounting = link.to(matrix), mounting.to(matrix)
-        whole = torch.cat([torch.cat([matrix, link], 1), torch.cat([link.T, mounting], 1)])
-        return as_covariance("covariance of calibration and mounting", whole, size + more)[:size, size:]
-
-
 def _pose_doubt(rotation: Tensor, translation: Tensor) -> str:
     """Why a relative pose is more likely a slip, or ""."""
     x, y, z = (-translation @ rotation).tolist()
@@ -639,14 +690,3 @@ def _pose_doubt(rotation: Tensor, translation: Tensor) -> str:
             "pose left_from_right? points_right = rotation @ points_left + translation is needed"
         )
     return ""
-
-
-def half_of_covariance(matrix: Tensor) -> Tensor:
-    """(K, P) with halfᵀ half = matrix (P, P), K being its rank."""
-    if is_differentiated(matrix):
-        raise InputError("the root of a covariance has no derivatives; give RigCovariance(half=...)")
-    scale = matrix.diagonal().sqrt()
-    safe = torch.where(scale > 0, scale, 1.0)
-    values, vectors = torch.linalg.eigh(matrix / safe[:, None] / safe[None, :])
-    kept = values > 1e-14 * values[-1:].sum().clamp_min(1e-300)
-    return (scale[:, None] * vectors[:, kept] * values[kept].sqrt()).T

@@ -21,7 +21,7 @@ from kcal.locate.siting import Site as Site
 from kcal.locate.siting import rank_sites as rank_sites
 
 # Geodesy
-from kcal.locate.geodesy import enu_from_cam as enu_from_cam
+from kcal.lens.pose import enu_from_cam as enu_from_cam
 from kcal.locate.geodesy import enu_to_geodetic as enu_to_geodetic
 from kcal.locate.geodesy import geodetic_to_enu as geodetic_to_enu
 from kcal.locate.tabulate import find_geoid as find_geoid

@@ -17,7 +17,6 @@ from kcal.finding import Finding
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Rig
-from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.localizer import Localizer
 from kcal.locate.marks import PAIR, PIXELS, Marks, pixel_of, read_marks
 from kcal.locate.max_likelihood import calibration_effect
@@ -299,7 +298,7 @@ def range_sigmas(
             pose = (effect.square().sum(-1) - lenses.square()).clamp_min(0.0).sqrt()
         stands = rig.mounting
         if stands is not None and stands.covariance is not None:
-            enu = points @ enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
+            enu = points @ stands.enu_from_cam.T
             level = torch.nn.functional.normalize(enu[:, :2], dim=-1)
             across = torch.stack([level[:, 1], -level[:, 0], torch.zeros_like(far)], -1)
             rows = (across[:, None] @ by_mounting(enu))[:, 0]

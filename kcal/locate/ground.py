@@ -18,8 +18,8 @@ from kcal.checks import as_points
 from kcal.errors import FileError, InputError, with_extra
 from kcal.files import read_head, read_text
 from kcal.lens.camera import Camera
-from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting
-from kcal.locate.geodesy import anchor, enu_from_cam, mean_radius, place_enu
+from kcal.lens.rig import REFRACTION_SIGMA, Mounting
+from kcal.locate.geodesy import anchor, mean_radius, place_enu
 from kcal.locate.mounting import by_mounting
 from kcal.locate.stereo import QUANTILE, PositionStatus, covariance_root, status_counts
 from kcal.locate.views import StatedHeight
@@ -386,9 +386,9 @@ def locate_on_ground(
     if step is not None and not 0 < step < farthest:
         raise InputError(f"step {step}: meters between 0 and {farthest:g} are needed")
     origin = mounting.origin
-    turn = enu_from_cam(mounting.heading_deg, mounting.pitch_deg, mounting.roll_deg)
+    turn = mounting.enu_from_cam
     curve = 0.5 / mean_radius(origin.lat)
-    bend = (REFRACTION if mounting.refraction is None else mounting.refraction) * curve
+    bend = mounting.refraction * curve
     rays, seen = camera.unproject(pixels)
     sight, place = rays @ turn.T, anchor(origin)
     seen = seen & torch.isfinite(pixels).all(-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from functools import partial
 from pathlib import Path
@@ -11,31 +12,19 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from kcal.checks import StatedModule, as_covariance, as_points, expanded, scalar
+from kcal.checks import StatedModule, as_points, expanded, scalar
 from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.pose import Movable, rotation_from_vector
 from kcal.lens.rig import (
-    REFRACTION,
-    REFRACTION_SIGMA,
-    Mounting,
     Origin,
     Rig,
-    RigCovariance,
-    check_refraction,
 )
-from kcal.locate.geodesy import (
-    anchor,
-    ecef_from_enu_rotation,
-    enu_from_cam,
-    enu_to_geodetic,
-    mean_radius,
-    place_enu,
-)
+from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, mean_radius, place_enu
 from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
-from kcal.locate.mounting import attitude, by_mounting, rig_errors, station_mounting, two_stations
+from kcal.locate.mounting import attitude, by_mounting, leveled, station_mounting
 from kcal.locate.stereo import (
     Localization,
     PositionStatus,
@@ -75,19 +64,18 @@ class Localizer(Operations, Movable, StatedModule):
 
     A point is the most likely one (Gauss-Newton on reprojection errors). What weighs its pixels is an option:
 
-    * `marks`, the default of two cameras on one mount: the pixels' covariances alone. Errors in the calibration
-      (`calibration`, a joint covariance of cameras and rig), in the mounting (`mounting`) and in refraction are added
-      to the covariance. A pair counts as a whole.
+    * `marks`, the default of two cameras in the left one's frame: the pixels' covariances alone. Errors in the
+      calibration, in the mounting and in refraction are added to the covariance. A pair counts as a whole.
     * `all`, the default of any other rig: also the errors that a camera's pixels share, which are lens, position,
-      attitude and refraction (`Rig.root`), and clocks. Any views of a point count: two give a position, one gives a
+      attitude and refraction, and clocks. Any views of a point count: two give a position, one gives a
       bearing, or a position where the height is stated. With three or more, one that contradicts the others is left
       out and named.
 
     Only the noise differs from point to point; all other errors move neighboring points together, so that averaging
     over frames does not reduce them.
 
-    A rig that says where it stands, or an `origin` and a heading, give positions on the Earth: east, north, up of the
-    origin, and WGS84. Otherwise they are in the rig's own frame, which is the left camera's for two cameras.
+    A rig that says where it stands gives positions on the Earth: east, north, up of the origin, and WGS84. Otherwise
+    they are in the rig's own frame, which is the left camera's for two cameras.
 
     Light bends downward: a point at the level distance d is k d² / 2R lower than a straight line of sight says, with R
     the Earth's radius and k the coefficient of refraction: 0.26 ± 0.20 m at 5 km, 0.01 m at 1 km. With all weights,
@@ -100,38 +88,23 @@ class Localizer(Operations, Movable, StatedModule):
     gradients reach the mounting of two cameras, as `Rig.free` the poses.
 
     Args:
-        rig: cameras and their poses. What is not given below is taken from the rig where it knows it; all but the
-            sigmas of pixels and clocks is for two cameras in the left one's frame.
+        rig: cameras, their poses, and what is known of them: `Rig.root`. `Rig.placed` puts two cameras elsewhere, or
+            into other light.
         weights: see above.
         pixel_sigma: standard deviation of a mark along each axis, px, where no covariance is given.
         clock_sigma: standard deviation of each camera's clock, seconds; counts where `forward` is told velocities.
         root: (K, P) like `rig.root`, in its place: for example `rig.with_errors(...)`.
-        origin: position of the left camera's projection center; with `heading_deg`, or neither: `rig.mounting`.
-        heading_deg: of the left camera's axis, clockwise from true north; see `enu_from_cam`.
-        pitch_deg: of the same axis, positive up.
-        roll_deg: of the left camera, positive clockwise as seen from behind.
-        calibration: how well the rig is known; `rig.covariance` if left out, and exact if that is None.
-        mounting: (6, 6) of `mounting_covariance`, or (7, 7) of `Mounting`; if left out, that of `rig.mounting`, and
-            exact for an `origin` that is given.
-        link: (P, 6) or (P, 7) covariance of the calibration with the mounting, where both come from the same landmarks;
-            that of `rig.mounting` if all of origin, calibration and mounting come from the rig.
-        refraction: k, bending of light as a share of the Earth's curvature; if left out, that of the landmarks of
-            `rig.mounting`, and 0.13 where there were none. For simulations and other straight lines it and its sigma
-            are 0.
-        refraction_sigma: standard deviation of k; if left out, as it comes with the mounting, and 0.1 otherwise, which
-            suits lines of sight some ten meters above the ground; near hot or cold ground 0.5 and more are usual. Where
-            `refraction` or its sigma is given, as for another day, landmarks say nothing of it.
 
     Raises:
-        InputError: an angle, sigma or covariance that cannot be, what does not suit the rig.
+        InputError: a sigma or root that cannot be, or weights that do not suit the rig.
         DegenerateError: weights by marks alone of a rig without a baseline.
 
     Example:
         >>> from kcal import Camera
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> localize = Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0,
-        ...                      pixel_sigma=0.1)
+        >>> there = rig.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> localize = Localizer(there, pixel_sigma=0.1)
         >>> left, right = torch.tensor([[960.0, 540.0]]), torch.tensor([[944.0, 540.0]])
         >>> found = localize(left, right)
         >>> [round(value, 2) for value in found.enu[0].tolist()], round(found.covariance[0, 1, 1].sqrt().item(), 2)
@@ -178,54 +151,33 @@ class Localizer(Operations, Movable, StatedModule):
         pixel_sigma: float = 0.3,
         clock_sigma: float = 0.0,
         root: Tensor | None = None,
-        origin: Origin | None = None,
-        heading_deg: float | None = None,
-        pitch_deg: float = 0.0,
-        roll_deg: float = 0.0,
-        calibration: RigCovariance | None = None,
-        mounting: Tensor | None = None,
-        link: Tensor | None = None,
-        refraction: float | None = None,
-        refraction_sigma: float | None = None,
     ) -> None:
         super().__init__()
         if weights not in (None, *get_args(Weights)):
             raise InputError(f"weights {weights!r}: marks or all is needed")
         if not 0.0 <= clock_sigma < math.inf:
             raise InputError(f"clock_sigma: seconds, not negative, are needed, got {clock_sigma}")
-        known = root is not None or rig.root is not None
-        self.weights: Weights = weights or ("marks" if rig.is_pair and not known else "all")
-        stated = {
-            "origin": origin, "heading_deg": heading_deg, "pitch_deg": pitch_deg or None, "roll_deg": roll_deg or None,
-            "calibration": calibration, "mounting": mounting, "link": link, "refraction": refraction,
-            "refraction_sigma": refraction_sigma,
-        }  # fmt: skip
-        more = {name: value for name, value in stated.items() if value is not None}
+        if root is not None:
+            rig = copy.copy(rig)
+            rig.root = root
+        self.weights: Weights = weights or ("marks" if rig.is_pair else "all")
         for name, value in (("pixel_sigma", checked_sigma(pixel_sigma)), ("clock_sigma", clock_sigma)):
             self.register_buffer(name, scalar(value, rig.translation))
         self.lens: tuple[tuple[int, ...], ...] = ()
         if self.weights == "marks":
-            if not rig.is_pair or known:
-                raise InputError('weights "marks": two cameras in the left one\'s frame are needed, without a root')
+            if not rig.is_pair:
+                raise InputError('weights "marks": two cameras in the left one\'s frame are needed')
             checked_rig(rig, pixel_sigma)
-            self._stand(rig, more)
-            self._weigh(rig, None)
+            self._stand(rig)
+            self._weigh(rig)
             return
-        if rig.is_pair and not known:
-            rig = Localizer(rig, weights="marks", **more).apart()  # type: ignore[arg-type]
-        elif more:
-            raise InputError(f"{next(iter(more))}: where these cameras stand, and how well that is known, says the rig")
-        root = rig.root if root is None else root
-        if root is not None:
-            rig.check_root(root)
-        self.rig = rig
-        self.included: tuple[str, ...] = (
-            ("marks",) if root is None or not bool(root.any()) else ("marks", "calibration", "mounting")
-        )
+        self.rig = rig = Localizer(rig, weights="marks").apart() if rig.is_pair else rig
+        known = rig.root is not None and bool(rig.root.any())
+        self.included: tuple[str, ...] = ("marks", "calibration", "mounting") if known else ("marks",)
         self._place(rig.origin, rig.translation)
         for name in ("refraction", "calibration_factor", "mounting", "link"):
             self.register_buffer(name, None)
-        self._weigh(rig, root)
+        self._weigh(rig)
 
     def _place(self, origin: Origin | None, like: Tensor) -> None:
         """Anchor the frame on the Earth, or nowhere."""
@@ -236,7 +188,7 @@ class Localizer(Operations, Movable, StatedModule):
         self.register_buffer("geodetic_of_origin", zero.to(like.device))
         self.register_buffer("half_curvature", scalar(0.5 / mean_radius(origin.lat) if origin else 0.0, like))
 
-    def _weigh(self, rig: Rig, root: Tensor | None) -> None:
+    def _weigh(self, rig: Rig) -> None:
         """Prepare weights by all errors; nothing of it where marks alone weigh."""
         names = ("up", "heights", "errors", "bending_errors", "limits")
         if self.weights == "marks":
@@ -252,7 +204,7 @@ class Localizer(Operations, Movable, StatedModule):
             geodetic = enu_to_geodetic(rig.center.detach(), rig.origin)
             ups = [ecef_from_enu_rotation(lat, lon)[:, 2].to(geodetic) for lat, lon, _ in geodetic.tolist()]
             up, heights = torch.stack(ups) @ self.ecef_from_enu, geodetic[:, 2]
-        errors, bending, self.lens = errors_by_camera(rig, root)
+        errors, bending, self.lens = errors_by_camera(rig)
         bending = None if bending is None else bending * self.half_curvature
         freedom = 2.0 * torch.arange(len(rig) + 1, dtype=torch.float64) - 3.0
         limits = [[float(chdtri(max(float(f), 1.0), p)) for f in freedom] for p in (_BAD, _DOUBTFUL)]
@@ -260,61 +212,24 @@ class Localizer(Operations, Movable, StatedModule):
         for name, value in zip(names, values, strict=True):
             self.register_buffer(name, value)
 
-    def _stand(self, rig: Rig, given: dict[str, Any]) -> None:
+    def _stand(self, rig: Rig) -> None:
         """Where two cameras stand, and how well that and the rig are known."""
-        place = rig.translation
-        stored, own = rig.covariance, not given.keys().isdisjoint(("refraction", "refraction_sigma"))
-        calibration, mounting, link = (given.get(name) for name in ("calibration", "mounting", "link"))
-        bending = given.get("refraction", REFRACTION), given.get("refraction_sigma", REFRACTION_SIGMA)
-        check_refraction(*bending)
-        stands: Mounting | None = rig.mounting
-        if ("origin" in given) != ("heading_deg" in given) or (
-            "origin" not in given and not given.keys().isdisjoint(("pitch_deg", "roll_deg"))
-        ):
-            raise InputError("origin and heading_deg belong together, and pitch_deg and roll_deg to them")
-        if "origin" in given:
-            stands = Mounting(
-                **{name: given[name] for name in ("origin", "heading_deg", "pitch_deg", "roll_deg") if name in given}
-            )
-        elif stands is not None:
-            if not own and stands.refraction is not None:
-                bending = (stands.refraction, bending[1])
-            if mounting is None:
-                mounting = stands.covariance
-                link = stands.link if link is None and calibration is None else link
-        elif mounting is not None or link is not None or own:
-            raise InputError("mounting, refraction: this rig does not say where it stands; give origin and heading_deg")
-        if stands is None:
-            bending = (0.0, 0.0)
-        calibration = stored if calibration is None else calibration
+        place, stands, known, calibration = rig.translation, rig.mounting, rig.relative_root, rig.covariance
         self.rig = rig
-        errors = (("marks", True), ("calibration", calibration is not None), ("mounting", mounting is not None))
-        self.included = tuple(name for name, there in errors if there)
         self._place(None if stands is None else stands.origin, place)
-        self.register_buffer("refraction", scalar(bending[0], place))
-        look = torch.eye(3, dtype=torch.float64)
-        if stands is not None:
-            look = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg)
+        self.register_buffer("refraction", scalar(0.0 if stands is None else stands.refraction, place))
+        look = torch.eye(3, dtype=torch.float64) if stands is None else stands.enu_from_cam
         self._keep("enu_from_rig", look.to(place.device))
-        factor = None
-        if calibration is not None:
-            calibration.check(rig)
-            factor = calibration.half.T.to(place.device) if bool(calibration.half.any()) else None
-        self.register_buffer("calibration_factor", factor)
-        if link is not None:
-            if calibration is None or mounting is None:
-                raise InputError("link: it needs the covariances of both the calibration and the mounting")
-            link = calibration.checked_link(mounting, link)
-        if mounting is None and bending[1]:
-            mounting = torch.zeros(6, 6, dtype=torch.float64)
-        if mounting is not None:
-            mounting = as_covariance("mounting", mounting, 7 if mounting.shape[-1:] == (7,) else 6)
-            if own or len(mounting) == 6:
-                mounting = torch.block_diag(mounting[:6, :6], torch.tensor([[bending[1] ** 2]], dtype=torch.float64))
-                link = None if link is None else torch.nn.functional.pad(link[:, :6], (0, 1))
-            mounting = mounting.to(place.device)
-        self.register_buffer("mounting", mounting)
-        self.register_buffer("link", None if link is None else link.to(place.device))
+        factor = None if calibration is None else calibration.half.T.to(place.device)
+        mounting = link = None
+        self.included = ("marks",) if factor is None else ("marks", "calibration")
+        if known is not None and bool(known[:, -7:].any()):
+            own = known[:, -7:].to(place.device)
+            mounting, cross = own.T @ own, known[:, :-7].to(place.device).T @ own
+            link = cross if bool(cross.any()) else None
+            self.included += ("mounting",) * bool(own[:, :6].any())
+        for name, value in (("calibration_factor", factor), ("mounting", mounting), ("link", link)):
+            self.register_buffer(name, value)
 
     @property
     def constants(self) -> object:
@@ -386,9 +301,7 @@ class Localizer(Operations, Movable, StatedModule):
             errors: how many shared errors the root has, some of them zero: a filter needs as many at every time, and
                 those of the calibration in the same order.
         """
-        size, look = sum(self.rig.sizes) + 6, self.enu_from_rig
-        half = rig_errors(size, self.calibration_factor, self.mounting, self.link, errors)
-        return two_stations(self.rig, look.T, self.origin, float(self.refraction), half)
+        return leveled(self.rig, self.enu_from_rig, self.origin, float(self.refraction), errors)
 
     def weighing_all(self, errors: int | None = None) -> Localizer:
         """The same with weights by all errors; `errors` as for `apart`.

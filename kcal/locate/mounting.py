@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.calibrate.rig.result import RigResult
 from kcal.errors import InputError
-from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance, half_of_covariance
+from kcal.lens.rig import REFRACTION, Mounting, Origin, Rig
 from kcal.locate.geodesy import ecef_from_enu_rotation, enu_to_geodetic
 from kcal.threads import in_one_thread
 
@@ -42,8 +42,7 @@ def mounting_of(
     center: Tensor,
     covariance: Tensor,
     origin: Origin,
-    link: Tensor | None = None,
-    refraction: float | None = None,
+    refraction: float = REFRACTION,
 ) -> Mounting:
     """How a camera with a pose in the frame of `origin` stands where it is.
 
@@ -56,8 +55,7 @@ def mounting_of(
         covariance: (6, 6) of the center and of turns of the camera, both about the frame's axes; (7, 7) with the
             coefficient of refraction.
         origin: of the frame.
-        link: (P, 6) or (P, 7) covariance of anything else with these.
-        refraction: the coefficient, if anything was found of it.
+        refraction: the coefficient.
 
     Example:
         >>> from kcal.locate import enu_from_cam
@@ -76,7 +74,6 @@ def mounting_of(
         pitch_deg=pitch,
         roll_deg=roll,
         covariance=both @ covariance @ both.T,
-        link=None if link is None else link @ both.T,
         refraction=refraction,
     )
 
@@ -105,9 +102,13 @@ def placed_rig(result: RigResult, origin: Origin) -> Rig:
     rig = result.stereo()
     covariance = result.mounting_covariance(0)
     if result.absolute and bool(torch.isfinite(covariance).all()):
-        rig.mounting = mounting_of(
-            result.rotation[0], result.center[0], covariance, origin, result.mounting_link(), result.refraction
-        )
+        stands = mounting_of(result.rotation[0], result.center[0], covariance, origin, result.refraction)
+        rig.mounting = stands
+        if (half := result.joint_half()) is not None:
+            # From axes of the frame to those at the camera.
+            turn = stands.enu_from_cam @ result.rotation[0]
+            both = torch.block_diag(torch.eye(half.shape[1] - 7).double(), turn, turn, torch.ones(1, 1).double())
+            rig.relative_root = half @ both.T
     return rig
 
 
@@ -131,49 +132,31 @@ def mounting_covariance(
     return torch.diag(torch.cat([values[:3], torch.deg2rad(values[3:])]) ** 2)
 
 
-class RunErrors(NamedTuple):
-    """What a `Localizer` is told of a rig's errors.
-
-    Attributes:
-        calibration: of cameras and relative pose; None where nothing is known.
-        mounting: (6, 6) or (7, 7) of origin and attitude, as in `Mounting`; None where all is exact.
-        link: of the two with each other, as in `Mounting`.
-    """
-
-    calibration: RigCovariance | None
-    mounting: Tensor | None
-    link: Tensor | None
-
-
-def run_errors(
-    rig: Rig, *, yaw_deg: float = 0.0, heading_deg: float = 0.0, origin_m: float = 0.0, elsewhere: bool = False
-) -> RunErrors:
-    """The errors that a rig knows of itself, and independent ones that are stated besides.
+def with_stated_errors(rig: Rig, *, yaw_deg: float = 0.0, heading_deg: float = 0.0, origin_m: float = 0.0) -> Rig:
+    """Two cameras with independent errors that are stated besides those that the rig knows of itself.
 
     Args:
-        rig: with its covariance and mounting, as far as they are known.
+        rig: with what is known of it.
         yaw_deg: standard deviation of the relative yaw.
         heading_deg: of the heading.
         origin_m: of the origin along each axis.
-        elsewhere: the rig does not stand as its mounting says, so that the mounting's errors are not its own.
 
     Example:
+        >>> from kcal import Origin
         >>> from kcal.rig import planned_rig
-        >>> errors = run_errors(planned_rig(), origin_m=0.02)
-        >>> errors.calibration is None, round(float(errors.mounting[0, 0]), 6)
+        >>> rig = planned_rig().placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
+        >>> found = with_stated_errors(rig, origin_m=0.02)
+        >>> found.covariance is None, round(float(found.mounting.covariance[0, 0]), 6)
         (True, 0.0004)
     """
-    calibration, stored = rig.covariance, None if elsewhere else rig.mounting
-    if yaw_deg:
-        yaw = torch.zeros(6, 6, dtype=torch.float64)
-        yaw[1, 1] = math.radians(yaw_deg) ** 2
-        calibration = (calibration or RigCovariance.of(rig)).with_pose(yaw)
-    mounting = mounting_covariance(origin_m=[origin_m] * 3, attitude_deg=(0.0, 0.0, heading_deg))
-    if stored is not None and stored.covariance is not None:
-        more = len(stored.covariance) - len(mounting)
-        mounting = torch.nn.functional.pad(mounting, (0, more, 0, more)) + stored.covariance
-    link = None if stored is None else stored.link
-    return RunErrors(calibration, mounting if bool(mounting.any()) else None, link)
+    same, known = copy.copy(rig), rig.relative_root
+    # Rotation and translation of the relative pose, place, attitude, refraction.
+    sigma = [0.0, math.radians(yaw_deg), 0.0, 0.0, 0.0, 0.0, *[origin_m] * 3, 0.0, 0.0, math.radians(heading_deg), 0.0]
+    more = torch.nn.functional.pad(torch.diag(rig.center.new_tensor(sigma)), (sum(rig.sizes), 0))
+    more = more[more.any(1)]
+    if len(more):
+        same.relative_root = more if known is None else torch.cat([known, more])
+    return same
 
 
 def by_mounting(enu: Tensor) -> Tensor:
@@ -186,78 +169,18 @@ def by_mounting(enu: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def rig_errors(
-    size: int, factor: Tensor | None, mounting: Tensor | None, link: Tensor | None, errors: int | None = None
-) -> Tensor | None:
-    """(K, size + 7) root of what is known of two cameras, in the order of `RigCovariance`, and of their mounting.
-
-    Args:
-        size: quantities of the cameras.
-        factor: (size, L) of them; its errors come first in the result.
-        mounting: (7, 7).
-        link: (size, 7) of the two with each other.
-        errors: how many errors there are at least, some of them zero.
-    """
-    if factor is None and mounting is None:
-        return None
-    like = factor if mounting is None else mounting
-    assert like is not None
-    stands = like.new_zeros(MOUNTING_ERRORS, MOUNTING_ERRORS) if mounting is None else mounting
-    half, left_over = like.new_zeros(0, size + MOUNTING_ERRORS), stands
-    if factor is not None:
-        # What the mounting owes to the calibration's errors: factor · ofᵀ = link.
-        of = like.new_zeros(MOUNTING_ERRORS, factor.shape[1])
-        if link is not None:
-            scale = torch.linalg.vector_norm(factor, dim=1, keepdim=True)
-            unit = torch.where(scale > 0, scale, 1.0)
-            of = torch.linalg.lstsq(factor / unit, link / unit, driver="gelsd").solution.T
-        half, left_over = torch.cat([factor, of]).T, stands - of @ of.T
-    # What the calibration's errors explain is zero but for rounding.
-    kept = left_over.diagonal() > 1e-12 * stands.diagonal()
-    own = half_of_covariance(left_over * (kept[:, None] & kept))
-    half = torch.cat([half, torch.nn.functional.pad(own, (size, 0))])
-    return torch.nn.functional.pad(half, (0, 0, 0, max((errors or 0) - len(half), 0)))
-
-
-@torch.no_grad()
-def two_stations(rig: Rig, left: Tensor, origin: Origin | None, refraction: float, half: Tensor | None) -> Rig:
-    """Two cameras as a rig in another frame, from which the left one is turned by `left`.
-
-    halfᵀ half is the covariance of the quantities of `RigCovariance`, and of place, attitude and refraction.
-    """
-    shift = rig.right_from_left_translation
-    left = left.to(shift)
-    right = rig.right_from_left_rotation @ left
-    apart = -right.T @ shift
-    centers = torch.stack([torch.zeros_like(apart), apart])
-    stations = Rig(
-        [rig.left, rig.right], ("left", "right"), torch.stack([left, right]), center=centers, origin=origin,
-        refraction=refraction,
-    )  # fmt: skip
-    if half is None:
-        return stations
-    size = half.shape[1] - 7
-    half, by = half.to(shift), shift.new_zeros(stations.quantities, half.shape[1])
-    lenses = size - 6
-    by[:lenses, :lenses] = torch.eye(lenses).to(shift)
-    turn, move, center, attitude = (slice(size + at, size + at + 3) for at in (-6, -3, 0, 3))
-    still = torch.eye(3).to(shift)
-    first, second = stations.pose_columns(0).start, stations.pose_columns(1).start
-    by[first : first + 3, center], by[first + 3 : first + 6, attitude] = still, still
-    by[second : second + 3, center] = still
-    by[second : second + 3, attitude] = -_crossed(apart)
-    by[second : second + 3, turn] = -right.T @ _crossed(shift)
-    by[second : second + 3, move] = -right.T
-    by[second + 3 : second + 6, attitude], by[second + 3 : second + 6, turn] = still, -right.T
-    by[-1, -1] = 1.0
-    stations.root = half @ by.T
-    return stations
-
-
-def _crossed(vector: Tensor) -> Tensor:
-    """(3, 3) with `_crossed(v) @ w` = v × w."""
-    x, y, z = vector.tolist()
-    return vector.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def leveled(rig: Rig, look: Tensor, origin: Origin | None, refraction: float, errors: int | None = None) -> Rig:
+    """The rig in another frame, from which its own is turned by `look` (3, 3); `errors` as for `Localizer.apart`."""
+    look = look.to(rig.center)
+    same = Rig(
+        rig.each, rig.names, rig.rotation @ look.T, center=rig.center @ look.T, origin=origin, refraction=refraction
+    )
+    if rig.root is not None:
+        root, count = rig.root.to(look), sum(rig.sizes)
+        poses = (root[:, count:-1].unflatten(1, (-1, 3)) @ look.T).flatten(1)
+        root = torch.cat([root[:, :count], poses, root[:, -1:]], 1)
+        same.root = torch.nn.functional.pad(root, (0, 0, 0, max((errors or 0) - len(root), 0)))
+    return same
 
 
 def station_mounting(rig: Rig, camera: int) -> Mounting:

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from kcal.errors import FileError, InputError
 from kcal.lens.camera import Camera
+from kcal.lens.pose import enu_from_cam
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Origin, Rig
-from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, geodetic_to_enu, mean_radius, place_enu
+from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, geodetic_to_enu, mean_radius, place_enu
 from kcal.locate.ground import Ground
 from kcal.locate.mounting import station_mounting
 from kcal.locate.tables import TableRow, read_rows

@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from kcal.errors import FileError, InputError
+from kcal.gaussian import half_of_covariance
 from kcal.lens.camera import Camera
-from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting, Origin, Rig, half_of_covariance
-from kcal.locate.geodesy import ecef_from_enu_rotation, enu_from_cam, geodetic_to_enu
+from kcal.lens.pose import enu_from_cam
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting, Origin, Rig
+from kcal.locate.geodesy import ecef_from_enu_rotation, geodetic_to_enu
 from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import attitude, station_mounting
 from kcal.locate.survey import EARTH, place_sigma

@@ -489,11 +489,11 @@ def reach_of(found: ViewsFit, variance: Tensor, weak_status: PositionStatus, beh
     return Reach(value, sigma, interval, weak, code)
 
 
-def errors_by_camera(rig: Rig, root: Tensor | None) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:
+def errors_by_camera(rig: Rig) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:
     """What `CommonErrors` contains: `half`, `bending` per unit of k, and `lens`."""
-    if root is None or not bool(root.any()):
+    if rig.root is None or not bool(rig.root.any()):
         return None, None, ()
-    root = root.to(rig.center)
+    root = rig.root.to(rig.center)
     lenses = root[:, : sum(rig.sizes)].split(list(rig.sizes), 1)
     wanted = [tuple(own.any(0).nonzero()[:, 0].tolist()) for own in lenses]
     if len(set(rig.sizes)) == 1:

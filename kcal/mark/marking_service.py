@@ -15,9 +15,10 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.errors import InputError, KcalError
 from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
+from kcal.lens.pose import enu_from_cam
 from kcal.lens.rig import Origin, Rig
 from kcal.locate.budget import range_sigmas
-from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
+from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks
 from kcal.locate.mounting import placed_rig
@@ -164,8 +165,8 @@ def verdict(promises: tuple[Promise, ...], count: int) -> tuple[str, bool]:
 
 def located(rig: Rig, marks: Marks, hand_sigma: float) -> Located:
     """Positions of targets; without a mounting, in a frame whose heading and place mean nothing."""
-    place, heading = (NOWHERE, 0.0) if rig.mounting is None else (None, None)
-    return locate_points(Localizer(rig, pixel_sigma=hand_sigma, origin=place, heading_deg=heading), marks)
+    rig = rig.placed(origin=NOWHERE, heading_deg=0.0) if rig.mounting is None else rig
+    return locate_points(Localizer(rig, pixel_sigma=hand_sigma), marks)
 
 
 # The map of a marking session: cameras, landmarks and targets with their 95 % regions, as latitudes and longitudes.
@@ -182,8 +183,7 @@ def map_content(rig: Rig, located: Located | None, survey: Survey | None, *, anc
     """
     origin, turn = NOWHERE, enu_from_cam(0.0)
     if rig.mounting is not None:
-        stands = rig.mounting
-        origin, turn = stands.origin, enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg)
+        origin, turn = rig.mounting.origin, rig.mounting.enu_from_cam
 
     def places(enu: Tensor, around: Origin) -> list[tuple[float, float]]:
         return [(lat, near(lon, origin.lon)) for lat, lon, _ in enu_to_geodetic(enu, around).tolist()]

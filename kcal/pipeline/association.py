@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -565,8 +566,8 @@ def _costs(rig: Rig, pixels: Tensor, boxes: Tensor, options: AssociationOptions)
     Infinite where impossible; differentiable by both.
     """
     # Where a mast stands does not matter.
-    alone = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
-    alone.covariance = rig.covariance
+    alone = copy.copy(rig)
+    alone.mounting = None
     localize, both = Localizer(alone, weights="all"), torch.tensor([0, 1]).expand(len(pixels), 2)
     return pair_costs(localize, both, pixels, boxes, options, _nearest(rig, options)).cost
 

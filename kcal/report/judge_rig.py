@@ -180,7 +180,7 @@ def rig_verdict(
         ([True, False], 'at 5 km the range is known to ±6.8 %; 5 % are required; most of it is from relative pose')
     """
     findings = [*_inherited(rig, cameras), *_own_findings(rig, result)]
-    if _is_pair(rig):
+    if rig.is_pair:
         compared = _pairs_compared(rig, result, pairs)
         if compared is not None and compared.pairs:
             findings.append(_synchrony_finding(compared))
@@ -190,20 +190,15 @@ def rig_verdict(
     worst = [_worst_sigmas(rig, requirement.distance, mark_sigma) for requirement in requirements]
     both = list(zip(requirements, worst, strict=True))
     findings += [_unseen_finding(requirement.distance) for requirement, one in both if one is None]
-    known = rig.covariance is not None or rig.root is not None
-    answers = tuple(_rig_answer(requirement, one, known, mark_sigma, beyond) for requirement, one in both)
+    answers = tuple(_rig_answer(requirement, one, rig.known, mark_sigma, beyond) for requirement, one in both)
     return Verdict(
         subject=subject,
         answers=answers,
         findings=weighed_findings(findings, answers),
         advice=tuple(f"{verdict.subject}: {text}" for verdict in cameras for text in verdict.advice),
-        basis=f"from the rig's own covariance, where {_LOOK[not _is_pair(rig)]}, with marks to {mark_sigma:g} px",
+        basis=f"from the rig's own covariance, where {_LOOK[not rig.is_pair]}, with marks to {mark_sigma:g} px",
         unexplained=max(beyond, default=0.0),
     )
-
-
-def _is_pair(rig: Rig) -> bool:
-    return len(rig) == 2 and rig.root is None
 
 
 def named_cameras(rig: Rig) -> list[tuple[str, Camera]]:
@@ -252,7 +247,7 @@ def _rig_answer(
 
 def _worst_sigmas(rig: Rig, distance: float, mark_sigma: float) -> RangeSigmas | None:
     """The worst of several places that two cameras see; None where there is none."""
-    if _is_pair(rig):
+    if rig.is_pair:
         return _worst_of_pair(rig, distance, mark_sigma)
     return station_sigmas(rig, distance, pixel_sigma=mark_sigma)
 
@@ -291,7 +286,7 @@ def _own_findings(rig: Rig, result: RigResult | None) -> list[Finding]:
 
 def _doubts(rig: Rig, result: RigResult | None) -> list[Finding]:
     found = []
-    if rig.root is None and rig.covariance is None:
+    if not rig.known:
         text = "the rig has no error bars: nobody can say how wrong its ranges are"
         found.append(Finding("error-bars", "stop", text, "solve it with kcal rig from cameras that kcal calibrated"))
     record = rig.calibration
@@ -323,13 +318,10 @@ def _exact_lenses(rig: Rig, result: RigResult | None) -> tuple[str, ...]:
     """Names of the cameras whose parameters have no error in the rig's covariance."""
     if result is not None:
         return result.exact
-    root = rig.root if rig.covariance is None else rig.covariance.half
-    if root is None:
+    if rig.root is None or not rig.known:
         return ()
-    named = named_cameras(rig)
-    sizes = [camera.values.shape[-1] for _, camera in named]
-    parts = zip(named, root[:, : sum(sizes)].split(sizes, 1), strict=True)
-    return tuple(name for (name, _), part in parts if not bool(part.any()))
+    parts = zip(rig.names, rig.root[:, : sum(rig.sizes)].split(rig.sizes, 1), strict=True)
+    return tuple(name for name, part in parts if not bool(part.any()))
 
 
 def _largest_variance(solved: RigResult | RigCalibration | None) -> float:

@@ -78,13 +78,9 @@ def _pixels_off(camera: Camera, truth: dict[str, Any]) -> tuple[Tensor, Tensor, 
 @torch.no_grad()
 def score_rig(rig: Rig, truth: dict[str, Any]) -> Table:
     """Ranges of marks without noise against the true ones, over the image, beside one sigma that the rig states."""
-    placed = rig.mounting is not None
-    localize = Localizer(
-        rig,
-        pixel_sigma=_EXACT,
-        origin=None if placed else Origin(lat=0.0, lon=0.0, height=0.0),
-        heading_deg=None if placed else 0.0,
-    )
+    if rig.mounting is None:
+        rig = rig.placed(origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0)
+    localize = Localizer(rig, pixel_sigma=_EXACT)
     columns = {"range_m": "at", "mean_m": "mean m", "rms_m": "RMS m", "stated_m": "one sigma as stated m"}
     rows: list[list[Any]] = []
     for pairs in truth["pairs"]:

@@ -20,13 +20,13 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.unknowns import held
 from kcal.checks import as_points, beyond_chance, chi2_quantile, variance_factor
 from kcal.errors import DegenerateError, InputError
+from kcal.gaussian import half_of_covariance
 from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
 from kcal.lens.pose import fit_turn, rotation_from_vector, seen_turned, vector_from_rotation
 from kcal.lens.projection import FAR
-from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig, RigCovariance
+from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig
 from kcal.locate.budget import usual_ranges
-from kcal.locate.geodesy import enu_from_cam
 from kcal.locate.marks import Marks
 from kcal.locate.mounting import attitude
 from kcal.locate.stereo import PositionStatus, sight_lines
@@ -293,8 +293,8 @@ class Drift:
     def relocked(self, note: str) -> Rig:
         """The old rig with the present attitudes; cameras and their places stay.
 
-        The covariance of the drift is added to that of the rig: the errors of the first solution are still in it, and
-        those of the check come on top. A rig that counted as exact has the latter alone.
+        The covariance of the drift is added to that of the rig and its mounting: the errors of the first solution are
+        still in it, and those of the check come on top. What counted as exact has the latter alone.
 
         Args:
             note: when and from what, for the record.
@@ -307,17 +307,16 @@ class Drift:
         """
         rig = self.old
         new = Rig.pair(rig.left, rig.right, self.rig.right_from_left_rotation, self.rig.right_from_left_translation)
-        new.covariance = (rig.covariance or RigCovariance.of(rig)).with_pose(self.pose_covariance)
-        new.mounting = rig.mounting
-        if rig.mounting is not None and self.cam_from_local is not None and self.left_covariance is not None:
-            rotation, covariance = self.cam_from_local, rig.mounting.covariance
-            heading, pitch, roll = attitude(rotation.T)
-            if covariance is not None:
-                covariance = covariance.clone()
-                covariance[3:6, 3:6] += rotation.T @ self.left_covariance @ rotation
-            new.mounting = dataclasses.replace(
-                rig.mounting, heading_deg=heading, pitch_deg=pitch, roll_deg=roll, covariance=covariance
-            )
+        known, stands, pad = rig.relative_root, rig.mounting, torch.nn.functional.pad
+        more = [pad(half_of_covariance(self.pose_covariance), (rig.quantities - 13, 7))]
+        if stands is not None and self.cam_from_local is not None and self.left_covariance is not None:
+            heading, pitch, roll = attitude(self.cam_from_local.T)
+            stands = dataclasses.replace(stands, heading_deg=heading, pitch_deg=pitch, roll_deg=roll)
+            more.append(pad(half_of_covariance(self.left_covariance) @ self.cam_from_local, (rig.quantities - 4, 1)))
+        new.mounting = stands
+        # The same number of shared errors at every time, for filters.
+        more = [pad(half, (0, 0, 0, most - len(half))) for half, most in zip(more, (6, 3), strict=False)]
+        new.relative_root = torch.cat(more if known is None else [known, *more])
         if rig.calibration is not None:
             new.calibration = dataclasses.replace(rig.calibration, relocked=note)
         return new
@@ -591,16 +590,12 @@ def check_rig(rig: Rig, *, features: Features | None = None, landmarks: Landmark
     refraction = REFRACTION, REFRACTION_SIGMA
     if rig.mounting is not None:
         stands = rig.mounting
-        rotation = enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
+        rotation = stands.enu_from_cam.T
         pose = rotation, torch.zeros(3, dtype=torch.float64)
         if stands.covariance is not None:
             left = rotation @ stands.covariance[3:6, 3:6] @ rotation.T
             # Light that was held straight stays so; otherwise another day has another coefficient.
-            straight = len(stands.covariance) == 7 and not bool(stands.covariance[6, 6])
-            refraction = (
-                REFRACTION if stands.refraction is None else stands.refraction,
-                0.0 if straight else REFRACTION_SIGMA,
-            )
+            refraction = stands.refraction, REFRACTION_SIGMA if bool(stands.covariance[6, 6]) else 0.0
     before = None if rig.covariance is None else (rig.covariance.matrix[-6:-3, -6:-3], left)
     return measure_drift(rig, features=features, landmarks=landmarks, pose=pose, before=before, refraction=refraction)
 

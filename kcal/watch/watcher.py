@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import dataclasses
 import itertools
 import json
 import math
@@ -23,8 +22,7 @@ import kcal.watch.history as past
 import kcal.watch.measure as measure
 from kcal.corners.images import Gray
 from kcal.errors import FileError, InputError
-from kcal.lens.rig import Rig, RigCovariance
-from kcal.locate.geodesy import enu_from_cam
+from kcal.lens.rig import Rig
 from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks
 from kcal.locate.points import PointLocator
@@ -35,7 +33,7 @@ from kcal.watch.turned import Drift, drift_of_turns
 # `Watched`: a rig and the history of its attitude; the rig of any time, with the errors of that time.
 
 # Number of shared errors that a time adds to those of the rig file.
-MORE_ERRORS = 6
+MORE_ERRORS = 9
 # Seconds of a history that are read before and after the wanted times; rows beyond change nothing.
 _BEFORE, _AFTER = 2 * 86400.0, 2 * 3600.0
 
@@ -107,7 +105,7 @@ class Watched:
     def cam_from_local(self) -> Tensor | None:
         """(3, 3) of the left camera, as the rig file says."""
         stands = self.rig.mounting
-        return None if stands is None else enu_from_cam(stands.heading_deg, stands.pitch_deg, stands.roll_deg).T
+        return None if stands is None else stands.enu_from_cam.T
 
     def turns_at(self, time: float, *, gusts: bool = True) -> past.Turns:
         """The turn of both cameras at a time, from the measurements before and after it.
@@ -139,25 +137,7 @@ class Watched:
         Raises:
             InputError: before the first measurement.
         """
-        drift = dataclasses.replace(self.drift_at(time), old=_uncertain(self.rig))
-        rig = drift.relocked(f"at {time:.3f} s, from the history of the watched rig")
-        # The same number of shared errors at every time, for filters.
-        known = rig.covariance
-        if known is not None:
-            more = len(self.rig.covariance.half if self.rig.covariance else []) + MORE_ERRORS - len(known.half)
-            rig.covariance = RigCovariance(half=torch.nn.functional.pad(known.half, (0, 0, 0, more)))
-        return rig
-
-
-def _uncertain(rig: Rig) -> Rig:
-    """The rig, with an exact mounting as one whose covariance is zero: a time adds to it."""
-    stands = rig.mounting
-    if stands is None or stands.covariance is not None:
-        return rig
-    same = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
-    same.covariance, same.calibration = rig.covariance, rig.calibration
-    same.mounting = dataclasses.replace(stands, covariance=torch.zeros(6, 6, dtype=torch.float64))
-    return same
+        return self.drift_at(time).relocked(f"at {time:.3f} s, from the history of the watched rig")
 
 
 def model_of(rows: Sequence[past.HistoryRow]) -> past.TurnModel:
@@ -265,17 +245,10 @@ class Followed:
 def standing(solved: Localizer, watched: Watched, time: float) -> Localizer:
     """A localizer as the rig stands at a time; its place stays where it was given."""
     rig = watched.rig_at(time)
-    if solved.rig.mounting is not None and solved.origin == solved.rig.mounting.origin:
-        return Localizer(rig, pixel_sigma=float(solved.pixel_sigma))
-    heading, pitch, roll = solved.attitude_deg
-    return Localizer(
-        rig,
-        origin=solved.origin,
-        heading_deg=heading,
-        pitch_deg=pitch,
-        roll_deg=roll,
-        pixel_sigma=float(solved.pixel_sigma),
-    )
+    if watched.rig.mounting is None or solved.origin != watched.rig.mounting.origin:
+        heading, pitch, roll = solved.attitude_deg
+        rig = rig.placed(origin=solved.origin, heading_deg=heading, pitch_deg=pitch, roll_deg=roll)
+    return Localizer(rig, pixel_sigma=float(solved.pixel_sigma))
 
 
 # Look at pairs of images as they come, write what they tell into the history, and say when a rig has drifted.

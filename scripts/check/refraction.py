@@ -19,8 +19,9 @@ import torch
 from torch import Tensor
 
 from kcal import Landmarks, Localizer, RigData, RigOptions, solve_rig
+from kcal.lens.pose import enu_from_cam
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA
-from kcal.locate.geodesy import enu_from_cam, mean_radius
+from kcal.locate.geodesy import mean_radius
 from kcal.rig import placed_rig
 from scripts.shared.long_range import ORIGIN, rig
 from scripts.shared.page import table

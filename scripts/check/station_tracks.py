@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 
 from kcal import Camera, Localizer, Rig
-from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_from_cam, enu_to_geodetic, geodetic_to_enu
+from kcal.lens.pose import enu_from_cam
+from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, geodetic_to_enu
 from kcal.pipeline.pairing import ObjectViews
 from kcal.track import AssociationOptions, ClockPrior, Detections, Motion, Tracker, TrackOptions, group_objects
 from scripts.shared.page import table

@@ -9,14 +9,8 @@ from torch import Tensor
 
 from kcal import Camera, Origin, Rig
 from kcal.lens import rotation_from_vector
-from kcal.locate.geodesy import (
-    anchor,
-    ecef_from_enu_rotation,
-    enu_from_cam,
-    enu_to_geodetic,
-    geodetic_to_enu,
-    mean_radius,
-)
+from kcal.lens.pose import enu_from_cam
+from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, geodetic_to_enu, mean_radius
 
 ORIGIN = Origin(lat=45.0, lon=6.0, height=800.0)
 

@@ -20,9 +20,9 @@ from kcal.io.camera_file import camera_to_file, save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import RigFile, load_rig
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector, vector_from_rotation
+from kcal.lens.pose import enu_from_cam, rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import Origin
-from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic
+from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.marks import read_marks, write_marks
 from kcal.locate.stations import station_mounting
 from scripts.check.moving import CAMERA, CENTERS, LATE, NAMES, simulated

@@ -21,10 +21,10 @@ from kcal.errors import DegenerateError, FileError, InputError
 from kcal.io.camera_file import save_camera
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens.pose import enu_from_cam, rotation_from_vector
 from kcal.lens.rig import Origin, Rig
 from kcal.locate.budget import station_sigmas
-from kcal.locate.geodesy import enu_from_cam, enu_to_geodetic, geodetic_to_enu
+from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 
 NAMES = ("mill", "mast", "church", "hill")

@@ -17,12 +17,12 @@ from locate_rigs import tensor
 
 from kcal import FileError, InputError, Origin
 from kcal.lens import save_onnx
+from kcal.lens.pose import enu_from_cam
 from kcal.locate.geodesy import (
     anchor,
     arc_tangent,
     azimuth_elevation,
     ecef_to_geodetic,
-    enu_from_cam,
     enu_to_geodetic,
     geodetic_to_ecef,
     geodetic_to_enu,

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from kcal.errors import InputError
-from kcal.locate.geodesy import enu_from_cam
+from kcal.lens.pose import enu_from_cam
 from kcal.sim.captures import project_board
 from kcal.sim.scene import DemoScene, demo_rig, mark_points, render_demo, scene_views
 

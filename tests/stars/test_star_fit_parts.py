@@ -17,9 +17,8 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.gaussian import Gaussian, triangular
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
-from kcal.lens.pose import rotation_from_vector, seen_turned
+from kcal.lens.pose import enu_from_cam, rotation_from_vector, seen_turned
 from kcal.lens.projection import FAR
-from kcal.locate.geodesy import enu_from_cam
 from kcal.solve.lm import LMOptions, minimize
 from kcal.stars.detect import DetectedStars, NightPlan, _signal
 from kcal.stars.lens import (

@@ -427,7 +427,7 @@ def _lost(cameras: Sequence[Camera], rig: Rig | None, known: CameraFormat, carri
         "calibration record": any(record.record is not None for record in records),
         "entrance pupil": any(bool((camera.coefficients[1:3] != 0).any()) for camera in cameras if camera.model.hybrid),
         "relative pose": rig is not None and len(cameras) > known.poses,
-        "covariance of the rig": rig is not None and (rig.covariance is not None or rig.root is not None),
+        "covariance of the rig": rig is not None and rig.known,
         "mounting": rig is not None and (rig.mounting is not None or rig.origin is not None),
     }
     return tuple(what for what, there in found.items() if there)

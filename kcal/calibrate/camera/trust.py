@@ -22,10 +22,10 @@ from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns, moving_residuals
 from kcal.calibrate.problem.views import Views, poses_under
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
+from kcal.gaussian import half_of_covariance
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.difference import CameraDifference, camera_difference
-from kcal.lens.rig import half_of_covariance
 from kcal.lens.uncertainty import ParaxialFocal, image_sigma, paraxial_focal, pixel_covariance, pixel_errors
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief

@@ -167,8 +167,7 @@ class RigResult(ArrowRows):
         translation = self.rotation[second] @ (self.center[first] - self.center[second])
         rig = Rig.pair(self.cameras[first], self.cameras[second], rotation, translation)
         half = self._solution.half_of(self._joint_rows(first, second))
-        if half is not None:
-            rig.covariance = RigCovariance(half=half)
+        rig.covariance = None if half is None else RigCovariance(half=half)
         rig.calibration = self._calibration(first, second)
         return rig
 
@@ -251,10 +250,12 @@ class RigResult(ArrowRows):
         sigma, amount = self._solution.variances(rows).sqrt(), maps @ self._solution.state.unknown
         return dict(zip(self.data.effects, zip(amount.tolist(), sigma.tolist(), strict=True), strict=True))
 
-    def mounting_link(self, first: int = 0, second: int = 1) -> Tensor:
-        """(P, 7) covariance of `joint_covariance`'s P quantities with `mounting_covariance`'s of the first camera."""
-        rows = [self._joint_rows(first, second), self._solution.mounting_rows(first)]
-        return self._solution.of(torch.cat(rows))[0][:-7, -7:]
+    def joint_half(self, first: int = 0, second: int = 1) -> Tensor | None:
+        """(K, P + 7) root of the covariance of `joint_covariance`'s P quantities and those of `mounting_covariance`.
+
+        None where the data leave one of them open.
+        """
+        return self._solution.half_of(torch.cat([self._joint_rows(first, second), self._solution.mounting_rows(first)]))
 
     def mounting_covariance(self, camera: int = 0) -> Tensor:
         """(7, 7) of a camera's center (meters), of small turns of it (radians), and of the coefficient of refraction.
