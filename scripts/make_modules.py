@@ -34,7 +34,7 @@ from kcal.lens.camera_parameters import CameraDistortion, ExtendedDistortion
 from kcal.lens.views import Cylinder
 from kcal.locate import DisparityRanges, Triangulate, enu_from_cam
 from kcal.nets import InverseNet, ResidualNet
-from kcal.rig import RigCovariance, mounting_covariance
+from kcal.rig import mounting_covariance
 from kcal.solve import LevenbergMarquardt
 from kcal.track import ObjectDisparity, PairBoxes
 
@@ -124,14 +124,16 @@ def pair_cov() -> Tensor:
 def stereo(number: int) -> Localizer:
     """With every kind of error."""
     own = rig(number)
-    half = 1e-4 * noise(5, 26, seed=3)
-    shared = 1e-3 * noise(5, 6, seed=4)
-    return Localizer(
-        own, origin=Origin(lat=19.07 + number, lon=72.87, height=14.0), heading_deg=30.0 + number, pitch_deg=1.0,
-        pixel_sigma=0.3 + 0.1 * number, calibration=RigCovariance(half=half), refraction=0.13 + 0.01 * number,
-        mounting=mounting_covariance(origin_m=(0.1, 0.1, 0.1), attitude_deg=(0.1, 0.1, 0.1)) + shared.T @ shared,
-        link=half.T @ shared,
-    ).free()  # fmt: skip
+    own = own.placed(
+        origin=Origin(lat=19.07 + number, lon=72.87, height=14.0), heading_deg=30.0 + number, pitch_deg=1.0,
+        covariance=mounting_covariance(origin_m=(0.1, 0.1, 0.1), attitude_deg=(0.1, 0.1, 0.1)),
+        refraction=0.13 + 0.01 * number,
+    )  # fmt: skip
+    known = own.relative_root
+    assert known is not None
+    linked = torch.cat([1e-4 * noise(5, 26, seed=3), 1e-3 * noise(5, 6, seed=4), torch.zeros(5, 1).double()], 1)
+    own.relative_root = torch.cat([linked, known])
+    return Localizer(own, pixel_sigma=0.3 + 0.1 * number).free()
 
 
 def stations(number: int = 0) -> Rig:

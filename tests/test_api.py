@@ -54,7 +54,7 @@ PUBLIC = {
     """,
     "kcal.locate": """
         BudgetErrors DisparityRanges Marks Site Triangulate area_of check_ranges enu_from_cam enu_to_geodetic find_geoid
-        geodetic_to_enu level_ground locate_on_ground range_errors rank_sites read_marks terrain
+        geodetic_to_enu level_ground range_errors rank_sites read_marks terrain
         write_positions
     """,
     "kcal.track": """

@@ -72,7 +72,7 @@ def test_a_program_runs_in_another_process(tmp_path: Path) -> None:
     rig = pinhole_rig()
     rig.covariance = RigCovariance.of(rig, pose=1e-8 * torch.eye(6).double())
     origin = Origin(lat=19.0, lon=72.0, height=10.0)
-    module, path = Localizer(rig, origin=origin, heading_deg=20.0), tmp_path / "locate.pt2"
+    module, path = Localizer(rig.placed(origin=origin, heading_deg=20.0)), tmp_path / "locate.pt2"
     left = torch.tensor([[980.0, 540.0], [960.0, 540.0], [950.0, 530.0]], dtype=torch.float64)
     right = left - torch.tensor([9.0, 0.1], dtype=torch.float64)
     count = torch.export.Dim("count", min=2)

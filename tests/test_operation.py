@@ -43,7 +43,7 @@ def localizer() -> Localizer:
     rig = stereo()
     rig.covariance = RigCovariance.of(rig, pose=1e-8 * torch.eye(6).double())
     origin = Origin(lat=19.0, lon=72.0, height=10.0)
-    return Localizer(rig, origin=origin, heading_deg=20.0, mounting=1e-6 * torch.eye(6).double())
+    return Localizer(rig.placed(origin=origin, heading_deg=20.0, covariance=1e-6 * torch.eye(6).double()))
 
 
 def marks(rig: Rig, count: int = 5) -> tuple[Tensor, Tensor]:

@@ -62,7 +62,7 @@ def test_modules() -> None:
     stations = Rig([CAMERA] * 9, list("abcdefghi"), look.repeat(9, 1, 1), center=torch.eye(9)[:, :3] * 3000.0)
     check(stations, "a, b, c", "up to 4240 m apart", "9 x Camera")
     origin = Origin(lat=19.07, lon=72.87, height=14.0)
-    localize = Localizer(RIG, origin=origin, heading_deg=35.0, pixel_sigma=0.1)
+    localize = Localizer(RIG.placed(origin=origin, heading_deg=35.0), pixel_sigma=0.1)
     check(localize, "lat=19.07", "heading=35°", "pixel_sigma=0.1, errors of marks", "10.0 m")
 
 
@@ -71,7 +71,7 @@ def test_results() -> None:
     right = left - torch.tensor([3.2, 0.0])
     right[5:] += 10.0
     check(Triangulate(RIG)(left, right), "Triangulation(5 OK, 2 PARALLEL, points=(7, 3)")
-    localize = Localizer(RIG, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
+    localize = Localizer(RIG.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0))
     check(localize(left, right), "Localization(5 OK, 2 PARALLEL, enu=(7, 3)")
     located = located_pairs(RIG, left[:1], right[:1], origin=Origin(lat=1.0, lon=2.0, height=3.0), heading_deg=0.0)
     check(located, "Located(")
@@ -165,7 +165,7 @@ def test_many_records_are_walked() -> None:
 
 
 def test_every_other_public_class_is_told_in_three_lines() -> None:
-    localize = Localizer(RIG, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
+    localize = Localizer(RIG.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0))
     board = Board(columns=7, rows=6, square=0.05)
     made = [
         CAMERA, RIG, localize, board, View(name="a", pixels=((0.0, 0.0),) * 42),

@@ -148,7 +148,7 @@ def test_what_shows_no_images(given: Any, message: str) -> None:
 RIG = Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
 LOOK = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).repeat(2, 1, 1)
 STATIONS = Rig([CAMERA] * 2, ["a", "b"], LOOK, center=torch.tensor([[0.0, 0, 0], [1000.0, 0, 0]]))
-LOCALIZE = Localizer(RIG, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+LOCALIZE = Localizer(RIG.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0))
 PIXELS = torch.full((4, 2), 200.0)
 NEXT = torch.tensor([[0.0, 0, 0, -1.0], [0, 0, 0, 0], [0, 0, 0, 0]])
 # Each with the last dimension that it needs.

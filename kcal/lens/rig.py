@@ -517,7 +517,7 @@ class Rig(Movable, StatedModule):
         size = self.quantities - 7
         parts = [pad(covariance, (0, 7))] if covariance is not None else []
         parts += [pad(mounting, (size, 0))] if mounting is not None else []
-        if parts:
+        if any(bool(part.any()) for part in parts):
             self.relative_root = torch.cat(parts)
         else:
             self.root = None

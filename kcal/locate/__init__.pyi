@@ -11,7 +11,6 @@ from kcal.locate.triangulate import Triangulate as Triangulate
 from kcal.locate.triangulate import DisparityRanges as DisparityRanges
 
 # Points on the ground
-from kcal.locate.ground import locate_on_ground as locate_on_ground
 from kcal.locate.ground import level_ground as level_ground
 from kcal.locate.ground import terrain as terrain
 

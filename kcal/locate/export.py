@@ -556,7 +556,8 @@ def write_positions(path: str | Path, located: Located) -> Path:
         >>> from kcal import Localizer, Origin, locate_points
         >>> from kcal.locate import Marks
         >>> from kcal.rig import planned_rig
-        >>> localize = Localizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> there = planned_rig().placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> localize = Localizer(there)
         >>> located = locate_points(localize, Marks(("1",), planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))[0]))
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_positions(Path(folder, "positions.csv"), located).read_text().splitlines()[1][:4]

@@ -14,14 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal.checks import as_points
 from kcal.errors import FileError, InputError, with_extra
 from kcal.files import read_head, read_text
-from kcal.lens.camera import Camera
-from kcal.lens.rig import REFRACTION_SIGMA, Mounting
-from kcal.locate.geodesy import anchor, mean_radius, place_enu
-from kcal.locate.mounting import by_mounting
-from kcal.locate.stereo import QUANTILE, PositionStatus, covariance_root, status_counts
+from kcal.locate.geodesy import mean_radius, place_enu
 from kcal.locate.views import StatedHeight
 from kcal.texts import brief
 
@@ -225,10 +220,6 @@ def _read_grid(path: Path) -> _Read:
     return heights, (1 / cell, 0.0, -x / cell, 0.0, -1 / cell, rows + y / cell), system
 
 
-# Where rays of one camera meet the ground, and from how far ahead.
-
-# One camera: pixels to places on the ground, a level surface or a terrain model, with their errors.
-#
 # A line of sight is followed outward until it is below the ground for the first time: what lies behind is hidden. Light
 # bends as for `Localizer`, and the ellipsoid falls away below the tangent plane.
 
@@ -240,34 +231,6 @@ _ROWS = 512
 _STEPS, _HALVINGS = 512, 50
 # Of a tangent that is found by differences, meters.
 _STEP_M = 0.5
-# A place whose range is not known to a third is told as a bearing only.
-_BEARING_SIGMAS = 3.0
-
-
-class GroundPlaces(NamedTuple):
-    """Result of `locate_on_ground`; nothing is NaN.
-
-    Attributes:
-        enu: (N, 3) meters east, north, up of the camera; zeros unless the status is OK.
-        covariance: (N, 3, 3), an infinite diagonal unless OK; along the ground, which a line of sight meets slantingly.
-        geodetic: (N, 3) latitude, longitude, ellipsoidal height of the place on the ground; the camera's unless OK.
-        range_low: (N,) meters, lower end of the 95 % interval; zero unless OK.
-        range_high: (N,) upper end; infinite unless OK.
-        bearing: (N, 3) unit vector east, north, up at the camera; zeros where the lens has no ray.
-        status: (N,) int8 codes of `PositionStatus`. BEARING_ONLY: the line of sight meets no ground within reach, meets
-            ground of unknown height, or meets it so flatly that the range is not known to a third.
-    """
-
-    enu: Tensor
-    covariance: Tensor
-    geodetic: Tensor
-    range_low: Tensor
-    range_high: Tensor
-    bearing: Tensor
-    status: Tensor
-
-    def __repr__(self) -> str:
-        return brief(self, status=status_counts(self.status))
 
 
 def level_ground(height: float) -> Ground:
@@ -300,13 +263,6 @@ class Meeting(NamedTuple):
     tangent: Tensor
     approach: Tensor
     met: Tensor
-
-
-def search_distances(farthest: float, step: float | None) -> Tensor:
-    """Where a line of sight is looked at: in equal steps, or in growing ones over level ground."""
-    if step is None:
-        return torch.logspace(0.0, math.log10(farthest), _STEPS, dtype=torch.float64)
-    return torch.arange(step, farthest + step, step, dtype=torch.float64)
 
 
 def first_meeting(
@@ -344,110 +300,13 @@ def first_meeting(
     return Meeting(distance, point, normal, tangent, torch.where(met, approach, -1.0), met)
 
 
-@torch.no_grad()
-def locate_on_ground(
-    camera: Camera,
-    mounting: Mounting,
-    pixels: Tensor,
-    ground: Ground,
-    *,
-    pixel_sigma: float = 1.0,
-    ground_sigma: float = 0.0,
-    farthest: float = 20_000.0,
-    step: float | None = None,
-) -> GroundPlaces:
-    """Where lines of sight meet the ground for the first time.
-
-    Args:
-        camera: calibrated.
-        mounting: where it stands and looks, with its covariance, and the refraction if it was found.
-        pixels: (N, 2), for example the bottom of a box, where a point stands.
-        ground: from `level_ground` or `terrain`.
-        pixel_sigma: standard deviation of a pixel along each axis, px.
-        ground_sigma: standard deviation of the ground's height, meters.
-        farthest: end of the search, meters.
-        step: of the search, meters, at most the size of a raster's cell so that no crest is jumped over; growing steps
-            for level ground if left out.
-
-    Raises:
-        InputError: wrong shapes, or a value that is not positive.
-
-    Example:
-        >>> from kcal import Origin
-        >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
-        >>> stands = Mounting(origin=Origin(lat=19.07, lon=72.87, height=30.0), heading_deg=0.0, refraction=0.0)
-        >>> found = locate_on_ground(camera, stands, torch.tensor([[960.0, 600.0], [960.0, 500.0]]), level_ground(10.0))
-        >>> round(found.enu[0, 1].item(), 1), found.status.tolist()
-        (533.9, [0, 6])
-    """
-    pixels = as_points("pixels", pixels, 2)
-    if pixels.ndim != 2 or not (pixel_sigma > 0 and ground_sigma >= 0 and 1.0 < farthest < math.inf):
-        raise InputError("ground: pixels (N, 2), a positive pixel_sigma and farthest, and no negative ground_sigma")
-    if step is not None and not 0 < step < farthest:
-        raise InputError(f"step {step}: meters between 0 and {farthest:g} are needed")
-    origin = mounting.origin
-    turn = mounting.enu_from_cam
-    curve = 0.5 / mean_radius(origin.lat)
-    bend = mounting.refraction * curve
-    rays, seen = camera.unproject(pixels)
-    sight, place = rays @ turn.T, anchor(origin)
-    seen = seen & torch.isfinite(pixels).all(-1)
-
-    def along(distance: Tensor, rows: Tensor) -> Tensor:
-        ray = sight[rows] if distance.ndim == 1 else sight[rows][:, None]
-        straight = distance[..., None] * ray
-        lower = torch.nn.functional.pad(straight[..., :2].square().sum(-1, keepdim=True), (2, 0))
-        return straight - bend * lower
-
-    def above(enu: Tensor) -> Tensor:
-        lat, lon, height = place_enu(enu, *place).unbind(-1)
-        return height - ground(lat, lon)
-
-    meeting = first_meeting(along, above, len(sight), search_distances(farthest, step))
-    distance, enu, normal, tangent, approach, met = meeting
-    met = met & seen
-
-    # How the place moves: by the four errors, and then along the line of sight back to the ground.
-    ends = [camera.unproject(pixels + shift)[0] for shift in 0.5 * torch.eye(2, dtype=torch.float64)]
-    starts = [camera.unproject(pixels - shift)[0] for shift in 0.5 * torch.eye(2, dtype=torch.float64)]
-    by_pixel = torch.stack([distance[:, None] * (b - a) @ turn.T for a, b in zip(starts, ends, strict=True)], -1)
-    known = torch.zeros(7, 7, dtype=torch.float64)
-    if mounting.covariance is not None:
-        size = len(mounting.covariance)
-        known[:size, :size] = mounting.covariance
-    if mounting.covariance is None or len(mounting.covariance) == 6:
-        known[6, 6] = REFRACTION_SIGMA**2
-    level = enu[:, :2].square().sum(-1)
-    bent = torch.nn.functional.pad(-curve * level[:, None, None], (0, 0, 2, 0))
-    moves = torch.cat([pixel_sigma * by_pixel, torch.cat([by_mounting(enu), bent], -1) @ covariance_root(known)], -1)
-    moves = moves - tangent[..., None] * (normal[:, None] @ moves / approach[:, None, None])
-    by_height = ground_sigma * tangent[..., None] / approach[:, None, None]
-    moves = torch.where(met[:, None, None], torch.cat([moves, by_height], -1), 0.0)
-    covariance = moves @ moves.mT
-    span = torch.linalg.vector_norm(enu, dim=-1)
-    sigma = (enu[:, None] @ moves)[:, 0].square().sum(-1).sqrt() / span.clamp_min(1e-9)
-    ok = met & (span > _BEARING_SIGMAS * sigma)
-    status = torch.where(ok, int(PositionStatus.OK), int(PositionStatus.BEARING_ONLY)).to(torch.int8)
-    status = torch.where(seen, status, int(PositionStatus.OUTSIDE_LENS)).to(torch.int8)
-    status = torch.where(camera.inside(pixels) | ~seen, status, int(PositionStatus.OUTSIDE_IMAGE)).to(torch.int8)
-    ok = status == int(PositionStatus.OK)
-    return GroundPlaces(
-        enu=torch.where(ok[:, None], enu, 0.0),
-        covariance=torch.where(ok[:, None, None], covariance, torch.diag(covariance.new_full((3,), math.inf))),
-        geodetic=torch.where(ok[:, None], place_enu(enu, *place), origin.geodetic),
-        range_low=torch.where(ok, (span - QUANTILE * sigma).clamp_min(0.0), 0.0),
-        range_high=torch.where(ok, span + QUANTILE * sigma, math.inf),
-        bearing=torch.where(seen[:, None], sight, 0.0),
-        status=status,
-    )
-
-
 # Where a camera's line of sight reaches a stated height or the ground, by which one camera alone is enough.
 
 # Steps to a stated height; each leaves a thousandth.
 _HEIGHT_STEPS = 3
 # Meters: how far a line of sight is followed until it meets the ground.
 _FARTHEST = 60_000.0
+_GROWING = torch.logspace(0.0, math.log10(_FARTHEST), _STEPS, dtype=torch.float64)
 
 
 class EarthFrame(NamedTuple):
@@ -524,8 +383,10 @@ def _ground_ahead(
         lat, lon, height = place_enu(points, *anchored).unbind(-1)
         return height - ground(lat, lon)
 
+    # In equal steps, or in growing ones over level ground.
     step = getattr(ground, "cell_m", None)
-    found = first_meeting(along, above, len(wanted), search_distances(_FARTHEST, step))
+    distances = torch.arange(step, _FARTHEST + step, step, dtype=torch.float64) if step else _GROWING
+    found = first_meeting(along, above, len(wanted), distances)
     met = torch.zeros_like(alone)
     met[wanted] = found.met
     point, normal = place + ray, torch.zeros_like(place)

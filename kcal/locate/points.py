@@ -78,7 +78,7 @@ def locate_points(
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> marks = Marks(("mast",), torch.tensor([[[960.0, 540.0], [944.0, 540.0]]]))
-        >>> localize = Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> localize = Localizer(rig.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0))
         >>> position = locate_points(localize, marks).positions[0]
         >>> round(position.range_m, 3), round(position.lat, 6), round(position.range_high_m, 1)
         (1000.0, 19.079034, 1054.8)

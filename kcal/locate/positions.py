@@ -407,7 +407,8 @@ def read_truth(path: str | Path, located: Located) -> Tensor:
         >>> from kcal import locate_points
         >>> from kcal.locate import Marks
         >>> from kcal.rig import planned_rig
-        >>> localize = Localizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> origin = Origin(lat=19.07, lon=72.87, height=14.0)
+        >>> localize = Localizer(planned_rig().placed(origin=origin, heading_deg=0.0))
         >>> located = locate_points(localize, Marks(("mast",), planned_rig()(torch.tensor([[0.0, 0.0, 1000.0]]))[0]))
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = Path(folder, "truth.csv").write_text("name,east,north,up\nmast,1,1000,0\n")
@@ -435,7 +436,7 @@ def position_errors(located: Located, truth: Tensor) -> list[tuple[float, float,
         >>> from kcal.locate import Marks
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
-        >>> localize = Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> localize = Localizer(rig.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0))
         >>> found = locate_points(localize, Marks(("1",), torch.tensor([[[960.0, 540.0], [944.0, 540.0]]])))
         >>> [round(value, 6) for value in position_errors(found, torch.tensor([[3.0, 996.0, 0.0]]).double())[0][:1]]
         [5.0]
@@ -468,7 +469,8 @@ def interval_coverage(localize: Localizer, left: Tensor, right: Tensor, ranges: 
     Example:
         >>> from kcal.rig import planned_rig
         >>> points = torch.tensor([[0.0, 0.0, 500.0], [9.0, 0.0, 800.0], [0.0, 9.0, 900.0]]).double()
-        >>> localize = Localizer(planned_rig(), origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+        >>> origin = Origin(lat=19.07, lon=72.87, height=14.0)
+        >>> localize = Localizer(planned_rig().placed(origin=origin, heading_deg=0.0))
         >>> left, right = planned_rig()(points)[0].unbind(-2)
         >>> round(interval_coverage(localize, left, right, torch.tensor([500.0, 2000.0, 900.0])), 3)
         0.667

@@ -592,8 +592,8 @@ def sites_of(rig: Rig, pixel_sigma: float = 0.3) -> list[Site]:
             alone = Rig([camera], [name], rig.rotation[c : c + 1], center=rig.center[c : c + 1], refraction=0.0)
             first = sum(rig.sizes[:c])
             columns = torch.cat([rig.root[:, first : first + rig.sizes[c]], rig.root[:, rig.pose_columns(c)]], 1)
-            root = torch.nn.functional.pad(columns, (0, 1))
-            half, bending, lens = errors_by_camera(alone, root)
+            alone.root = torch.nn.functional.pad(columns, (0, 1))
+            half, bending, lens = errors_by_camera(alone)
             if half is not None and bending is not None:
                 spread = spread + _common_variance(alone, CommonErrors(lens, half, bending), rays @ rig.rotation[c])
         sigma = [float((spread[:, axis].sqrt() * steps[axis]).median()) for axis in (0, 1)]

@@ -326,7 +326,7 @@ class Tracker:
         >>> from kcal import Origin
         >>> from kcal.rig import planned_rig
         >>> rig = planned_rig()
-        >>> tracker = Tracker(Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0))
+        >>> tracker = Tracker(Localizer(rig.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)))
         >>> for time in torch.arange(10).double() / 10:
         ...     place = torch.tensor([[0.0, 0.0, 500.0]]) + time * torch.tensor([8.0, 0.0, 0.0])
         ...     left, right = rig(place)[0].unbind(-2)

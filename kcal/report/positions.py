@@ -74,7 +74,7 @@ def positions_figure(located: Located, truth: Tensor | None = None, figure: Figu
         >>> camera = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
         >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> marks = Marks(("mast",), rig(torch.tensor([[50.0, 0.0, 900.0]]))[0])
-        >>> localize = Localizer(rig, origin=Origin(lat=19.0, lon=72.9, height=0.0), heading_deg=35.0)
+        >>> localize = Localizer(rig.placed(origin=Origin(lat=19.0, lon=72.9, height=0.0), heading_deg=35.0))
         >>> located = locate_points(localize, marks)
         >>> len(positions_figure(located).axes)
         2

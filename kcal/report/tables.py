@@ -129,7 +129,7 @@ def chance_text(located: Located, truth: Tensor) -> str:
         >>> from kcal.rig import planned_rig
         >>> import torch
         >>> points = torch.tensor([[0.0, 0.0, 1000.0]] * 7, dtype=torch.float64)
-        >>> localize = Localizer(planned_rig(), origin=Origin(lat=19.0, lon=72.9, height=0.0), heading_deg=0.0)
+        >>> localize = Localizer(planned_rig().placed(origin=Origin(lat=19.0, lon=72.9, height=0.0), heading_deg=0.0))
         >>> found = locate_points(localize, Marks(tuple("abcdefg"), planned_rig()(points)[0]))
         >>> chance_text(found, points[:, [0, 2, 1]])
         'The true range is inside 7 of 7 intervals. Of 7 intervals of 95 %, one or more miss in 30 % of all runs.'

@@ -121,8 +121,10 @@ def known_to() -> RigCovariance:
 @section("locate.md", "localizer", rounds=1, points=COUNTS[:1])
 @torch.no_grad()
 def localizer(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[str]:
-    plain = Localizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1)
-    known = Localizer(rig(), origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1, calibration=known_to())
+    plain = Localizer(rig().placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
+    wide = rig()
+    wide.covariance = known_to()
+    known = Localizer(wide.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
     rows = []
     for count in points:
         left, right = rig()(some_points(count))[0].unbind(-2)
@@ -142,8 +144,9 @@ def localizer(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[st
 def coverage(draws: int = 40_000) -> Iterator[str]:
     """Simulated marks, and rigs drawn from their own covariance, at seven ranges."""
     there, known = rig(), known_to()
-    plain = Localizer(there, origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1)
-    wide = Localizer(there, origin=ORIGIN, heading_deg=35.0, pixel_sigma=0.1, calibration=known)
+    plain = Localizer(there.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
+    there.covariance = known
+    wide = Localizer(there.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
     factor, generator = known.half.T, torch.Generator().manual_seed(7)
     rows = []
     for i, distance in enumerate(RANGES):

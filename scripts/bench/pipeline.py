@@ -74,7 +74,7 @@ def localizer(lens: str) -> tuple[Localizer, Tensor, Tensor]:
         own = torch.diag(torch.tensor([0.1, 0.1, 0.1, 0.1, 1e-3, *([1e-4] * len(values))], dtype=torch.float64) ** 2)
         whole.covariance = RigCovariance.of(whole, left=own, right=own, pose=1e-9 * torch.eye(6).double())
         rig = whole
-    localize = Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
+    localize = Localizer(rig.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0))
     random = torch.Generator().manual_seed(0)
     depth = 10 ** (2.0 + 1.5 * torch.rand(PAIRS, 1, generator=random).double())
     place = (torch.rand(PAIRS, 2, generator=random).double() - 0.5) * torch.tensor([0.9, 0.5])
@@ -154,7 +154,7 @@ def boxes(pixels: Tensor) -> Detections:
 def latency(calls: int = 200, eager: bool = False) -> Iterator[str]:
     """So many calls of each; `eager` leaves out the compiled one."""
     rig = site_rig()
-    localize = Localizer(rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0)
+    localize = Localizer(rig.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0))
     compiled = None
     if not eager:
         localize.whole_graph = True

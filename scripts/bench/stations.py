@@ -130,7 +130,7 @@ def two(pairs: int = 200_000) -> Iterator[str]:
         marked = torch.stack([left, right], 1) + 0.2 * torch.randn(pairs, 2, 2, generator=generator).double()
         with torch.no_grad():
             (ours, by_pair), (theirs, by_views) = (
-                _timed(Localizer(rig, pixel_sigma=0.2, refraction_sigma=0.0), marked[:, 0], marked[:, 1]),
+                _timed(Localizer(rig.placed(refraction_sigma=0.0), pixel_sigma=0.2), marked[:, 0], marked[:, 1]),
                 _timed(Localizer(rig, weights="all", pixel_sigma=0.2), marked),
             )
         both = (ours.status == 0) & (theirs.status == 0)

@@ -82,8 +82,8 @@ def fit_cameras(folder: Path, common: Path, only: list[str]) -> dict[str, Any]:
 def positions(found: RigResult, pixels: Tensor) -> dict[str, Any]:
     """Points of marks (N, 2, 2) with their covariance, and the rig that located them."""
     pair = found.stereo()
-    known = RigCovariance.of(pair, joint=found.joint_covariance())
-    localize = Localizer(pair, origin=site.ORIGIN, heading_deg=0.0, pixel_sigma=_SIGMA, calibration=known)
+    pair.covariance = RigCovariance.of(pair, joint=found.joint_covariance())
+    localize = Localizer(pair.placed(origin=site.ORIGIN, heading_deg=0.0), pixel_sigma=_SIGMA)
     answer = localize(pixels[:, 0], pixels[:, 1])
     return {
         "points": answer.enu.tolist(),

@@ -43,7 +43,7 @@ def localizer(lens: str) -> Localizer:
     rig.covariance = RigCovariance.of(rig, pose=1e-8 * torch.eye(6, dtype=torch.float64))
     mounting = 1e-6 * torch.eye(6, dtype=torch.float64)
     origin = Origin(lat=19.07, lon=72.87, height=14.0)
-    return Localizer(rig, origin=origin, heading_deg=35.0, pixel_sigma=0.1, mounting=mounting)
+    return Localizer(rig.placed(origin=origin, heading_deg=35.0, covariance=mounting), pixel_sigma=0.1)
 
 
 def marks(module: Localizer, repeats: int) -> tuple[Tensor, Tensor]:

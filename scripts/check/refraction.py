@@ -85,7 +85,7 @@ def heights(place: Site, generator: torch.Generator, noise: float, learned: bool
     options = RigOptions(intrinsics="fixed", refraction_sigma=REFRACTION_SIGMA if learned else 0.0)
     solved = solve_rig(data, options)
     k, sigma = (None, None) if learned else (REFRACTION, REFRACTION_SIGMA)
-    localize = Localizer(placed_rig(solved, ORIGIN), pixel_sigma=MARK, refraction=k, refraction_sigma=sigma)
+    localize = Localizer(placed_rig(solved, ORIGIN).placed(refraction=k, refraction_sigma=sigma), pixel_sigma=MARK)
     marks = place.target_marks + MARK * normal(place.target_marks)
     found = localize(marks[:, 0], marks[:, 1])
     # Across the line of sight, upward: errors of the range are not those of light.

@@ -137,7 +137,7 @@ def coverage(draws: int = 100, marks: int = 50) -> Iterator[str]:
     ahead = torch.stack([angles.sin(), 0.02 * torch.arange(len(RANGES)) - 0.06, angles.cos()], -1)
     targets = far[:, None] * ahead / torch.linalg.vector_norm(ahead, dim=-1, keepdim=True) @ LOOK
     exact = seen(targets)
-    best = Localizer(TRUTH, origin=ORIGIN, heading_deg=HEADING, pixel_sigma=MARK)(exact[:, 0], exact[:, 1])
+    best = Localizer(TRUTH.placed(origin=ORIGIN, heading_deg=HEADING), pixel_sigma=MARK)(exact[:, 0], exact[:, 1])
     bound = best.inverse_range_sigma
     rows = []
     for kind in (
@@ -152,10 +152,8 @@ def coverage(draws: int = 100, marks: int = 50) -> Iterator[str]:
             draw = generator(10_000 + seed)
             found = solve_rig(data(kind.replace("20 summits", "summits"), draw), STRAIGHT)
             pair = found.stereo()
-            known = RigCovariance.of(pair, joint=found.joint_covariance())
-            localize = Localizer(
-                pair, origin=ORIGIN, heading_deg=HEADING, pixel_sigma=MARK, calibration=known
-            )  # fmt: skip
+            pair.covariance = RigCovariance.of(pair, joint=found.joint_covariance())
+            localize = Localizer(pair.placed(origin=ORIGIN, heading_deg=HEADING), pixel_sigma=MARK)
             noisy = exact + MARK * normal((marks, *exact.shape), draw)
             answer = localize(noisy[..., 0, :], noisy[..., 1, :])
             inside.append(((answer.range_low <= far) & (far <= answer.range_high)).double().mean(0))

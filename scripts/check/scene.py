@@ -390,7 +390,7 @@ def at_five_km(found: RigResult, draw: torch.Generator) -> tuple[Tensor, Tensor]
     ray = 5000.0 * ray / ray.norm(dim=-1, keepdim=True)
     left, right = RIG(ray)[0].unbind(-2)
     noise = MARK * torch.randn(2, 9, 2, dtype=torch.float64, generator=draw)
-    where = Localizer(found.stereo(), origin=ORIGIN, heading_deg=0.0, pixel_sigma=MARK)(
+    where = Localizer(found.stereo().placed(origin=ORIGIN, heading_deg=0.0), pixel_sigma=MARK)(
         left + noise[0], right + noise[1]
     )
     return 5000.0 * where.inverse_range - 1.0, 5000.0 * where.inverse_range_sigma

@@ -52,10 +52,9 @@ def drawn_site(seed: int, frames: int) -> Site:
     rig = planned_rig()
     pose = torch.zeros(6, 6, dtype=torch.float64)
     pose[1, 1] = math.radians(YAW_SIGMA) ** 2
-    localize = Localizer(
-        rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0, refraction=0.0, refraction_sigma=0.0,
-        calibration=RigCovariance.of(rig, pose=pose),
-    )  # fmt: skip
+    rig.covariance = RigCovariance.of(rig, pose=pose)
+    place = Origin(lat=19.07, lon=72.87, height=14.0)
+    localize = Localizer(rig.placed(origin=place, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0))
     yaw = math.radians(YAW_SIGMA) * torch.randn((), generator=generator, dtype=torch.float64)
     turn = rotation_from_vector(torch.tensor([0.0, float(yaw), 0.0], dtype=torch.float64))
     true = Rig.pair(rig.left, rig.right, turn @ rig.right_from_left_rotation, rig.right_from_left_translation)
@@ -157,7 +156,9 @@ def run_seed(seed: int, seconds: float, figures: Figures) -> None:
     # The same without clock errors in the estimate of what is expected: knows the offset exactly.
     informed = Tracker(site.localize, options, clock=ClockPrior(offset_s=OFFSET))
     # Filter against filter: both know the rig and the clock, and get the same pairs.
-    plain = Localizer(site.true, origin=site.localize.origin, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0)
+    plain = Localizer(
+        site.true.placed(origin=site.localize.origin, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0)
+    )
     # The rival knows no errors that last, and the marks have none.
     equal = Tracker(plain, dataclasses.replace(options, lasting_px=0.0), clock=ClockPrior(offset_s=OFFSET))
     positions, pixels = OfPositions(ACCELERATION, options.speed_mps), OfPixels(ACCELERATION, options.speed_mps)

@@ -140,8 +140,8 @@ def judged(truth: Rig, found: RigResult, draw: Draw, widen: float = 1.0) -> tupl
     noise = MARK * Draw(draw.seed + 500).normal(2, *left.shape)
     solved = found.stereo()
     assert solved.covariance is not None
-    known = RigCovariance(half=widen * solved.covariance.half)
-    localize = Localizer(solved, origin=ORIGIN, heading_deg=35.0, pixel_sigma=MARK, calibration=known)
+    solved.covariance = RigCovariance(half=widen * solved.covariance.half)
+    localize = Localizer(solved.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=MARK)
     answer = localize(left + noise[0], right + noise[1])
     inside = (answer.range_low <= far) & (far <= answer.range_high) & seen
     error = torch.where(seen, answer.inverse_range * far - 1.0, 0.0).square().sum(1) / seen.sum(1)

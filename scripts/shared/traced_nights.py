@@ -207,7 +207,7 @@ def judged(found: RigResult, there: Targets, seed: int) -> np.ndarray:
         marks = there.pixels
         if sigma == MARK:
             marks = marks + MARK * torch.randn(marks.shape, dtype=torch.float64, generator=generator)
-        answer = Localizer(pair, origin=ORIGIN, heading_deg=35.0, pixel_sigma=sigma)(*marks)
+        answer = Localizer(pair.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=sigma)(*marks)
         inside = (answer.range_low <= 1 / there.inverse) & (1 / there.inverse <= answer.range_high)
         if sigma != MARK:
             columns += [

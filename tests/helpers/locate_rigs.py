@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -13,6 +14,7 @@ from kcal import Camera, Localizer, Rig, locate_points
 from kcal.locate import Marks
 from kcal.locate.positions import Located
 from kcal.locate.tabulate import Geoid
+from kcal.rig import RigCovariance
 
 SIZE = (1920, 1080)
 
@@ -53,11 +55,21 @@ def spread_points(ranges: Tensor) -> Tensor:
     return torch.stack([ranges * angle.sin(), 0.1 * ranges * (7 * angle).sin(), ranges * angle.cos()], -1)
 
 
+def standing(
+    rig: Rig, *, calibration: RigCovariance | None = None, pixel_sigma: float = 0.3, **place: Any
+) -> Localizer:
+    """Of a rig that is placed, with this covariance if it is given."""
+    if calibration is not None:
+        rig = copy.copy(rig)
+        rig.covariance = calibration
+    return Localizer(rig.placed(**place), pixel_sigma=pixel_sigma)
+
+
 def located_pairs(
     rig: Rig, left: Tensor, right: Tensor, *, names: Sequence[str] | None = None, cov: Tensor | None = None,
     geoid: Geoid | None = None, **options: Any,
 ) -> Located:  # fmt: skip
-    """Positions of pixels in the left and the right image; `options` are those of `Localizer`."""
+    """Positions of pixels in the left and the right image; `options` are those of `standing`."""
     names = [str(i + 1) for i in range(len(left))] if names is None else names
     cov = None if cov is None else cov.expand(len(left), 4, 4)
-    return locate_points(Localizer(rig, **options), Marks.of_pair(names, left, right, cov), geoid=geoid)
+    return locate_points(standing(rig, **options), Marks.of_pair(names, left, right, cov), geoid=geoid)

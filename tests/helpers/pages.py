@@ -109,7 +109,7 @@ def capturing(folder: Path) -> Iterator[Opened]:
 def crowded_map(targets: int) -> Iterator[LiveMap]:
     """A live map of targets at 100 m to 3 km, many of them side by side."""
     site = tracked_site(0.01)
-    page = LiveMap(PointLocator(Localizer(site.rig, origin=site.origin, heading_deg=0.0)).located(), 0)
+    page = LiveMap(PointLocator(Localizer(site.rig.placed(origin=site.origin, heading_deg=0.0))).located(), 0)
     reach = 100.0 * 30.0 ** torch.linspace(0, 1, targets).double()
     side = 0.3 * reach * torch.sin(2.4 * torch.arange(targets).double())
     left, right = site.rig(torch.stack([side, 0 * side, reach], -1))[0].unbind(-2)

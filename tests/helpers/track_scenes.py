@@ -28,7 +28,8 @@ def tracked_site(yaw_deg: float = 0.0, **options: object) -> Localizer:
     pose = torch.zeros(6, 6, dtype=torch.float64)
     pose[1, 1] = math.radians(yaw_deg) ** 2
     known = {"origin": ORIGIN, "heading_deg": 0.0, "refraction": 0.0, "refraction_sigma": 0.0} | options
-    return Localizer(rig, calibration=RigCovariance.of(rig, pose=pose), **known)  # type: ignore[arg-type]
+    rig.covariance = RigCovariance.of(rig, pose=pose)
+    return Localizer(rig.placed(**known))  # type: ignore[arg-type]
 
 
 def pairs_of(

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from kcal import Camera, FileError, InputError, Rig, load_rig, save_rig
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
@@ -49,11 +50,37 @@ def as_two(content: dict[str, Any]) -> dict[str, Any]:
     return {**content, "left": left, "right": right, "right_from_left": pose, "calibration": solved}
 
 
+def assert_close(known: Tensor, half: Tensor) -> None:
+    """Both roots have the same covariance, in units of its standard deviations."""
+    unit = torch.where(half.any(0), half.norm(dim=0), 1.0)
+    torch.testing.assert_close((known.T @ known) / unit / unit[:, None], (half.T @ half) / unit / unit[:, None],
+                               rtol=0, atol=1e-12)  # fmt: skip
+
+
 def assert_same_rig(before: dict[str, Any], path: Path) -> None:
-    """What 1.0 wrote of two cameras is in a present file, to the last bit."""
-    after = as_two(json.loads(path.read_text()))
-    for key in ("left", "right", "right_from_left", "half", "mounting"):
+    """What 1.0 wrote of two cameras is in a present file, to the last bit, and its covariances to rounding."""
+    after, rig = as_two(json.loads(path.read_text())), load_rig(path)
+    for key in ("left", "right", "right_from_left"):
         assert_same(before[key], after[key], key)
+    stands, relative = before["mounting"], rig.relative_root
+    if before["half"] is None:
+        assert rig.covariance is None
+    else:
+        assert_close(relative[:, :-7], Packed.model_validate(before["half"]).tensor())
+    if stands is None:
+        assert rig.mounting is None
+        return
+    assert_same({k: v for k, v in after["mounting"].items() if k != "refraction"}, {k: stands[k] for k in (
+        "lat", "lon", "height", "heading_deg", "pitch_deg", "roll_deg")})  # fmt: skip
+    covariance = torch.tensor(stands["covariance"], dtype=torch.float64)
+    unit = covariance.diagonal().sqrt()
+    found = rig.mounting.covariance[:6, :6]
+    torch.testing.assert_close(found / unit / unit[:, None], covariance / unit / unit[:, None], rtol=0, atol=1e-12)
+    assert float(rig.mounting.covariance[6, 6]) == pytest.approx(0.01)
+    link, spread = torch.tensor(stands["link"], dtype=torch.float64), relative[:, :-7].norm(dim=0)
+    spread = torch.where(spread > 0, spread, 1.0)[:, None]
+    found = relative[:, :-7].T @ relative[:, -7:-1]
+    torch.testing.assert_close(found / unit / spread, link / unit / spread, rtol=0, atol=1e-10)
     for key, value in (before["calibration"] or {}).items():
         if key not in ("baseline_m", "frame"):
             assert_same(value, after["calibration"][key], f"calibration.{key}")
@@ -144,7 +171,8 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     content = json.loads(SAMPLE.read_text())
     for change, complaint in (
         ({"link": content["mounting"]["link"][1:]}, "link must be 26 x 6"),
-        ({"covariance": None}, "link needs the mounting's covariance"),
+        ({"link": [[1e3] * 6] * 26}, "covariance of rig and mounting.*not a covariance"),
+        ({"covariance": None}, "link needs the covariances of the rig and of the mounting"),
         ({"lat": 95.0}, "lat"),
         ({"speed": 1.0}, "Extra"),
     ):

@@ -58,7 +58,7 @@ def test_positions_are_those_of_the_camera_that_it_stands_for(kind: str) -> None
     origin = Origin(lat=50.0, lon=8.0, height=100.0)
     for pair in ((make(), make()), (make(), camera), (camera, make())):
         localize = [
-            Localizer(rig(*cameras), origin=origin, heading_deg=30.0, pixel_sigma=0.1)
+            Localizer(rig(*cameras).placed(origin=origin, heading_deg=30.0), pixel_sigma=0.1)
             for cameras in (pair, (camera, camera))
         ]
         found, wanted = (one(*pixels) for one in localize)

@@ -127,5 +127,5 @@ def test_ranges_and_covariance_without_the_earth() -> None:
     # Z = f b / d: its sigma is Z² / (f b) times that of a disparity, √2 of a mark's.
     assert float(found.covariance[0, 2, 2].sqrt()) == pytest.approx(1000.0**2 / 16000 * 0.1 * 2**0.5, rel=1e-3)
     assert found.covariance[1].diagonal().tolist() == [float("inf")] * 3
-    located = Localizer(own, origin=Origin(lat=0, lon=0, height=0), heading_deg=0.0)(left, right)
+    located = Localizer(own.placed(origin=Origin(lat=0, lon=0, height=0), heading_deg=0.0))(left, right)
     assert located.range.tolist() == pytest.approx([1000.0, float("inf"), float("inf")])

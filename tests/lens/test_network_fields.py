@@ -170,7 +170,7 @@ def test_positions_carry_gradients_to_the_weights() -> None:
     assert rig.left.field is not None
     weight = rig.left.get_parameter("field.gate")
     origin = Origin(lat=50.0, lon=8.0, height=100.0)
-    for module in (Triangulate(rig), Localizer(rig, pixel_sigma=0.2, origin=origin, heading_deg=0.0)):
+    for module in (Triangulate(rig), Localizer(rig.placed(origin=origin, heading_deg=0.0), pixel_sigma=0.2)):
 
         def place(module: nn.Module = module) -> Tensor:
             found = module(pixels[0].detach(), pixels[1].detach())

@@ -34,7 +34,7 @@ MARKS = Marks(
 
 
 def located(lon: float = 72.87, rig: Rig | Localizer | None = None) -> Located:
-    place = Localizer(RIG, origin=Origin(lat=19.07, lon=lon, height=14.0), heading_deg=90.0)
+    place = Localizer(RIG.placed(origin=Origin(lat=19.07, lon=lon, height=14.0), heading_deg=90.0))
     return locate_points(rig or place, MARKS)
 
 
@@ -119,7 +119,7 @@ def test_without_pyarrow_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch
 
 def test_an_empty_table_has_the_same_columns() -> None:
     run = located()
-    empty = PointLocator(Localizer(RIG, origin=run.origin, heading_deg=90.0)).located().to_arrow()
+    empty = PointLocator(Localizer(RIG.placed(origin=run.origin, heading_deg=90.0))).located().to_arrow()
     wanted = run.to_arrow().drop_columns("class")
     assert empty.schema.equals(wanted.schema)
 

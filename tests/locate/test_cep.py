@@ -24,7 +24,7 @@ def test_skewed_positions_of_a_real_geometry_by_simulation() -> None:
     """0.1 px at 5 km and f b = 16 000 px m: a thousand times longer than wide."""
     rig, n = pinhole_rig(1600.0, 10.0), 40_000
     left, right = rig(tensor([0.0, 0.0, 5000.0]))[0].unbind(-2)
-    module = Localizer(rig, origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0, pixel_sigma=0.1)
+    module = Localizer(rig.placed(origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0), pixel_sigma=0.1)
     noise = 0.1 * torch.randn(2, n, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     found = module(left + noise[0], right + noise[1])
     middle = module(left, right)

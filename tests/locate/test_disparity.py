@@ -91,7 +91,7 @@ def test_errors_against_a_truth() -> None:
     assert not inside
     assert found[2] is None
     assert position_errors(located, tensor([math.nan, 0, 0], [0, 0, 0], [0, 0, 0]))[0] is None
-    localize = Localizer(RIG, origin=ORIGIN, heading_deg=0.0, **STRAIGHT)
+    localize = Localizer(RIG.placed(origin=ORIGIN, heading_deg=0.0, **STRAIGHT))
     true = points.norm(dim=-1)
     assert interval_coverage(localize, left[:2], right[:2], true[:2]) == 1.0
     assert interval_coverage(localize, left[:2], right[:2], tensor(500.0, 1200.0)) == 0.5

@@ -10,7 +10,7 @@ import torch
 from command_line import Command
 
 from kcal import InputError, Localizer, Origin, load_rig
-from kcal.rig import Mounting, RigCovariance
+from kcal.rig import Mounting
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
 LEFT, RIGHT = torch.tensor([[960.0, 540.0], [700.0, 600.0]]), torch.tensor([[925.0, 535.0], [620.0, 592.0]])
@@ -37,17 +37,17 @@ def test_the_same_intervals_as_the_command(tmp_path: Path, command: Command) -> 
 
 def test_what_is_given_replaces_what_the_rig_knows() -> None:
     rig = load_rig(SAMPLE)
-    assert rig.mounting is not None
     own = Localizer(rig)(LEFT, RIGHT)
-    exact = RigCovariance.of(rig)
-    narrow = Localizer(rig, calibration=exact)(LEFT, RIGHT)
-    assert (narrow.inverse_range_sigma < own.inverse_range_sigma).all()
-    elsewhere = Localizer(rig, origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0)
+    elsewhere = Localizer(rig.placed(origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0))
     assert elsewhere.included == ("marks", "calibration")
-    assert torch.equal(elsewhere(LEFT, RIGHT).inverse_range_sigma, own.inverse_range_sigma)
-    # Without the link, errors of calibration and mounting are taken as independent: another covariance.
-    loose = Localizer(rig, mounting=rig.mounting.covariance)
-    assert not torch.allclose(loose(LEFT, RIGHT).covariance, own.covariance, rtol=1e-5)
+    torch.testing.assert_close(elsewhere(LEFT, RIGHT).inverse_range_sigma, own.inverse_range_sigma, rtol=1e-9, atol=0.0)
+    # What is set is independent of the rest: another covariance than that of both together.
+    rig.mounting = rig.mounting
+    assert not torch.allclose(Localizer(rig)(LEFT, RIGHT).covariance, own.covariance, rtol=1e-5)
+    rig.covariance = None
+    narrow = Localizer(rig)
+    assert narrow.included == ("marks", "mounting")
+    assert (narrow(LEFT, RIGHT).inverse_range_sigma < own.inverse_range_sigma).all()
 
 
 def test_half_a_mounting_is_refused() -> None:
@@ -55,11 +55,11 @@ def test_half_a_mounting_is_refused() -> None:
     origin = Origin(lat=0.0, lon=0.0, height=0.0)
     for options in ({"origin": origin}, {"heading_deg": 10.0}, {"pitch_deg": 1.0}):
         with pytest.raises(InputError, match="belong together"):
-            Localizer(rig, **options)
+            rig.placed(**options)
     rig.mounting = None
     assert not Localizer(rig).on_earth
-    for options in ({"mounting": torch.eye(6)}, {"refraction": 0.1}):
+    for options in ({"covariance": torch.eye(6)}, {"refraction": 0.1}):
         with pytest.raises(InputError, match="does not say where it stands"):
-            Localizer(rig, **options)
+            rig.placed(**options)
     rig.mounting = Mounting(origin=origin, heading_deg=10.0)
     assert Localizer(rig).attitude_deg == (10.0, 0.0, 0.0)

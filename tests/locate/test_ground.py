@@ -11,8 +11,10 @@ import pytest
 import torch
 
 from kcal import Camera, FileError, InputError, Localizer, Origin, Rig
-from kcal.locate import enu_from_cam, geodetic_to_enu, level_ground, locate_on_ground, terrain
-from kcal.rig import Mounting, mounting_covariance
+from kcal.locate import enu_from_cam, geodetic_to_enu, level_ground, terrain
+from kcal.locate.ground import Ground
+from kcal.locate.localizer import Localization
+from kcal.rig import Mounting, mounting_covariance, station_rig
 
 CAMERA = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
 ORIGIN = Origin(lat=19.07, lon=72.87, height=60.0)
@@ -24,8 +26,15 @@ def stands(**more: object) -> Mounting:
 
 
 def pixels_of(mounting: Mounting, enu: torch.Tensor) -> torch.Tensor:
-    turn = enu_from_cam(mounting.heading_deg, mounting.pitch_deg, mounting.roll_deg)
-    return CAMERA.project(enu @ turn)[0]
+    return CAMERA.project(enu @ mounting.enu_from_cam)[0]
+
+
+def on_ground(
+    mounting: Mounting, pixels: torch.Tensor, ground: Ground, pixel_sigma: float, sigma: float = 1e-4
+) -> Localization:
+    """What one camera sees; straight light where its covariance says nothing of it."""
+    rig = station_rig({"one": CAMERA}, [mounting], refraction=mounting.refraction, refraction_sigma=0.0)
+    return Localizer(rig, pixel_sigma=pixel_sigma)(pixels[:, None], height=ground, height_sigma=sigma)
 
 
 @pytest.mark.parametrize("distance", [200.0, 1000.0, 5000.0])
@@ -33,7 +42,7 @@ def test_a_place_on_the_ellipsoid_is_found_again(distance: float) -> None:
     """Pyproj says where the ground is at that distance: the ellipsoid has fallen 1.96 m at 5 km."""
     lon, lat, _ = pyproj.Geod(ellps="WGS84").fwd(ORIGIN.lon, ORIGIN.lat, 40.0, distance)
     true = geodetic_to_enu(torch.tensor([[lat, lon, 12.0]], dtype=torch.float64), ORIGIN)
-    found = locate_on_ground(CAMERA, stands(), pixels_of(stands(), true), level_ground(12.0), pixel_sigma=0.02)
+    found = on_ground(stands(), pixels_of(stands(), true), level_ground(12.0), 0.02)
     torch.testing.assert_close(found.enu, true, rtol=0, atol=1e-6 * distance)
     # A place on known ground errs along the ground only.
     down = torch.cat([true[0, :2] / 6.35e6, torch.ones(1).double()])
@@ -45,8 +54,8 @@ def test_refraction_lowers_what_is_far() -> None:
     """Bent light comes from lower places: the ground is met nearer."""
     true = torch.tensor([[0.0, 4000.0, 0.0]]).double() @ torch.eye(3).double()
     mark = pixels_of(stands(heading_deg=0.0), true - torch.tensor([0.0, 0.0, 50.0]))
-    straight = locate_on_ground(CAMERA, stands(heading_deg=0.0), mark, level_ground(10.0), pixel_sigma=0.1)
-    bent = locate_on_ground(CAMERA, stands(heading_deg=0.0, refraction=0.5), mark, level_ground(10.0), pixel_sigma=0.1)
+    straight = on_ground(stands(heading_deg=0.0), mark, level_ground(10.0), 0.1)
+    bent = on_ground(stands(heading_deg=0.0, refraction=0.5), mark, level_ground(10.0), 0.1)
     lower = 0.5 * 4000.0**2 / 2 / 6.35e6
     slope = 50.0 / 4000.0 - 4000.0 / 6.35e6
     assert float(straight.enu[0, 1] - bent.enu[0, 1]) == pytest.approx(lower / slope, rel=0.1)
@@ -57,10 +66,7 @@ def test_refraction_counts_the_level_distance() -> None:
     high = Origin(lat=19.07, lon=72.87, height=5000.0)
     steep = {"origin": high, "heading_deg": 0.0, "pitch_deg": -60.0, "roll_deg": 0.0}
     mark = torch.tensor([[960.0, 540.0]], dtype=torch.float64)
-    straight, bent = (
-        locate_on_ground(CAMERA, stands(**steep, refraction=k), mark, level_ground(0.0), pixel_sigma=0.1).enu[0]
-        for k in (0.0, 0.5)
-    )
+    straight, bent = (on_ground(stands(**steep, refraction=k), mark, level_ground(0.0), 0.1).enu[0] for k in (0.0, 0.5))
     level = float(straight[1])
     lower = 0.5 * level**2 / 2 / 6.35e6
     # It falls by tan 60° for each meter forward, and the ground by 0.0005.
@@ -73,7 +79,7 @@ def test_errors_are_as_large_as_stated() -> None:
     true = geodetic_to_enu(torch.tensor([[19.076, 72.874, 12.0]], dtype=torch.float64), ORIGIN)
     mounting = stands(covariance=torch.block_diag(known, torch.zeros(1, 1).double()))
     pixel = pixels_of(mounting, true)
-    stated = locate_on_ground(CAMERA, mounting, pixel, level_ground(12.0), pixel_sigma=0.5, ground_sigma=0.4)
+    stated = on_ground(mounting, pixel, level_ground(12.0), 0.5, 0.4)
     marks, places = [], []
     for _ in range(400):
         error = known.diagonal().sqrt() * torch.randn(6, generator=generator).double()
@@ -86,7 +92,7 @@ def test_errors_are_as_large_as_stated() -> None:
         noise = 0.5 * torch.randn(1, 2, generator=generator).double()
         marks.append(CAMERA.project((real - error[:3]) @ angle @ turn)[0] + noise)
         places.append(real)
-    found = locate_on_ground(CAMERA, mounting, torch.cat(marks), level_ground(12.0), pixel_sigma=0.5).enu
+    found = on_ground(mounting, torch.cat(marks), level_ground(12.0), 0.5).enu
     found = found - torch.cat(places)
     spread = torch.cov(found.T)[:2, :2]
     ratio = torch.linalg.eigvals(torch.linalg.solve(stated.covariance[0, :2, :2], spread)).real
@@ -117,12 +123,12 @@ def test_a_ridge_hides_what_is_behind_it(tmp_path: Path) -> None:
     level = stands(heading_deg=0.0, pitch_deg=0.0, roll_deg=0.0)
     # The camera is at 60 m. Down to the plain before the ridge; toward the plain behind it; into the sky.
     true = torch.tensor([[0.0, 300.0, -50.0], [0.0, 1000.0, -50.0], [0.0, 1000.0, 50.0]]).double()
-    found = locate_on_ground(CAMERA, level, pixels_of(level, true), ground, pixel_sigma=0.3, step=5.0)
+    found = on_ground(level, pixels_of(level, true), ground, 0.3)
     assert found.status.tolist() == [0, 0, 6]
     assert float(found.enu[0, 1]) == pytest.approx(300.0, abs=1.0)
     assert 430.0 < float(found.enu[1, 1]) < 450.0, "the near slope of the ridge"
     assert found.range_high[2] == math.inf
-    plain = locate_on_ground(CAMERA, level, pixels_of(level, true), level_ground(10.0), pixel_sigma=0.3)
+    plain = on_ground(level, pixels_of(level, true), level_ground(10.0), 0.3)
     assert float(plain.enu[1, 1]) == pytest.approx(1000.0, rel=0.01)
 
 
@@ -131,7 +137,7 @@ def test_unknown_ground_is_not_guessed(tmp_path: Path) -> None:
     ground = terrain(raster_file(tmp_path))
     level = stands(heading_deg=0.0, pitch_deg=0.0, roll_deg=0.0)
     true = torch.tensor([[0.0, 2000.0, 1.0]]).double()
-    assert locate_on_ground(CAMERA, level, pixels_of(level, true), ground, step=5.0).status.tolist() == [6]
+    assert on_ground(level, pixels_of(level, true), ground, 1.0).status.tolist() == [6]
     assert terrain(raster_file(tmp_path), geoid_height=-60.0)(
         torch.tensor([ORIGIN.lat]).double(), torch.tensor([ORIGIN.lon]).double()
     ).tolist() == [-50.0]
@@ -156,16 +162,15 @@ def test_heights_are_interpolated_between_the_centers_of_cells(tmp_path: Path) -
 def test_a_flat_line_of_sight_is_a_bearing_only() -> None:
     level = stands(pitch_deg=0.0, roll_deg=0.0)
     grazing = torch.tensor([[960.0, 549.0], [5000.0, 700.0], [math.nan, 0.0]]).double()
-    found = locate_on_ground(CAMERA, level, grazing, level_ground(58.0), pixel_sigma=4.0)
-    assert found.status.tolist() == [6, 5, 1]
+    found = on_ground(level, grazing, level_ground(58.0), 4.0)
+    assert found.status.tolist() == [6, 5, 4]
     assert all(bool(torch.isfinite(value).all()) for value in (found.enu, found.geodetic, found.bearing))
     assert found.bearing[2].tolist() == [0.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("wrong", [{"pixel_sigma": 0.0}, {"ground_sigma": -1.0}, {"step": 0.0}, {"farthest": 0.5}])
-def test_impossible_values(wrong: dict[str, float]) -> None:
-    with pytest.raises(InputError):
-        locate_on_ground(CAMERA, stands(), torch.zeros(1, 2), level_ground(0.0), **wrong)
+def test_impossible_values() -> None:
+    with pytest.raises(InputError, match="height_sigma"):
+        on_ground(stands(), torch.zeros(1, 2), level_ground(0.0), 1.0, 0.0)
     with pytest.raises(InputError, match="ground height"):
         level_ground(math.nan)
 
@@ -178,28 +183,19 @@ def test_a_file_that_is_no_raster(tmp_path: Path) -> None:
         terrain(path)
 
 
-def test_one_camera_of_a_rig_meets_the_ground_as_a_camera_alone_does(tmp_path: Path) -> None:
-    """`Localizer` with the terrain, beside `locate_on_ground`; what two cameras see needs no ground."""
+def test_what_two_cameras_see_needs_no_ground(tmp_path: Path) -> None:
     ground = terrain(raster_file(tmp_path))
-    known = mounting_covariance(origin_m=(0.5, 0.5, 0.3), attitude_deg=(0.01, 0.01, 0.02))
-    known = torch.block_diag(known, torch.full((1, 1), 0.01).double())
-    stand = stands(heading_deg=0.0, pitch_deg=0.0, roll_deg=0.0, refraction=0.2, covariance=known)
     look = enu_from_cam(0.0).T
     centers = torch.tensor([[0.0, 0, 0], [200.0, 0, 0]], dtype=torch.float64)
     rig = Rig([CAMERA] * 2, ["a", "b"], torch.stack([look, look]), center=centers, origin=ORIGIN, refraction=0.2)
     rig.root = rig.with_errors(position_m=(0.5, 0.5, 0.3), attitude_deg=(0.01, 0.01, 0.02), refraction=0.1)
     # The plain, the ridge, unknown ground over it, the sky.
     aims = [[0.0, 300, -50], [40, 700, -50], [0, 1000, -50], [0, 2000, 1], [0, 1000, 50]]
-    pixels = pixels_of(stand, torch.tensor(aims, dtype=torch.float64))
-    alone = locate_on_ground(CAMERA, stand, pixels, ground, pixel_sigma=0.3, ground_sigma=2.0, step=10.0)
     marks = torch.full((6, 2, 2), math.nan, dtype=torch.float64)
-    marks[:5, 0] = pixels
+    marks[:5, 0] = CAMERA.project(torch.tensor(aims, dtype=torch.float64) @ look.T)[0]
     marks[5] = rig(torch.tensor([[20.0, 900.0, -10.0]]))[0][0]
     found = Localizer(rig, pixel_sigma=0.3)(marks, height=ground, height_sigma=2.0)
-    assert alone.status.tolist() == [0, 0, 0, 6, 6]
     assert found.status.tolist() == [0, 0, 0, 6, 6, 0]
-    torch.testing.assert_close(found.enu[:3], alone.enu[:3], rtol=0, atol=1e-3)
-    torch.testing.assert_close(found.covariance[:3], alone.covariance[:3], rtol=1e-2, atol=1e-3)
     without = Localizer(rig, pixel_sigma=0.3)(marks)
     assert without.status.tolist() == [6, 6, 6, 6, 6, 0]
     torch.testing.assert_close(found.enu[5], without.enu[5])

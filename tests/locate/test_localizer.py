@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from kornia.geometry.subpix import spatial_soft_argmax2d
-from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turned
+from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, standing, tensor, turned
 
 from kcal import Camera, DegenerateError, InputError, Origin, PositionStatus, Rig
 from kcal.lens import rotation_from_vector
@@ -23,7 +23,7 @@ N = 8000
 def localizer(rig: Rig = RIG, **options: object) -> Localizer:
     """Of a rig that sees along straight lines."""
     straight = {"refraction": 0.0, "refraction_sigma": 0.0}
-    return Localizer(rig, **{"origin": ORIGIN, **ATTITUDE, **straight, **options})
+    return standing(rig, **{"origin": ORIGIN, **ATTITUDE, **straight, **options})
 
 
 def noise(sigma: float, *shape: int, seed: int = 3) -> torch.Tensor:
@@ -104,20 +104,20 @@ def test_errors_of_the_calibration_are_in_the_interval(z: float) -> None:
         for points, part in ((point.expand(count, 1, 3), draws[:, :9]), (in_right, draws[:, 9:18]))
     ]
     marks = torch.cat(seen, -1) + noise(0.1, count, 4, seed=9)
-    found = Localizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1, calibration=known)(
+    found = standing(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1, calibration=known)(
         marks[:, :2], marks[:, 2:]
     )
     # 4000 draws know 95 % to 0.34 %; three of those.
     assert 0.94 < covered(found, point.norm()) < 0.96
-    blind = Localizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1)(marks[:, :2], marks[:, 2:])
+    blind = Localizer(rig.placed(origin=ORIGIN, heading_deg=0.0), pixel_sigma=0.1)(marks[:, :2], marks[:, 2:])
     assert covered(blind, point.norm()) < 0.85
 
 
 def test_mounting_adds_the_origin_and_what_a_turn_does_at_a_distance() -> None:
     left, right = RIG(spread_points(tensor(1000.0)))[0].unbind(-2)
     plain = localizer()(left, right)
-    standing = mounting_covariance(origin_m=(0.5, 0.0, 0.0), attitude_deg=(0.0, 0.0, 0.1))
-    added = localizer(mounting=standing)(left, right).covariance - plain.covariance
+    standing_errors = mounting_covariance(origin_m=(0.5, 0.0, 0.0), attitude_deg=(0.0, 0.0, 0.1))
+    added = localizer(covariance=standing_errors)(left, right).covariance - plain.covariance
     east, north, _ = plain.enu[0].tolist()
     turn = math.radians(0.1)
     expected = tensor(
@@ -137,7 +137,7 @@ def test_places_follow_the_origin_and_turns_of_the_mounting() -> None:
         return rotation_from_vector(standing[3:]) @ enu + standing[:3]
 
     root = torch.diag(tensor(0.5, 0.3, 0.2, 1e-3, 2e-3, 3e-3)) @ (torch.eye(6).double() + 0.3 * noise(1.0, 6, 6))
-    added = localizer(mounting=root @ root.T)(left, right).covariance - plain.covariance
+    added = localizer(covariance=root @ root.T)(left, right).covariance - plain.covariance
     for enu, more in zip(plain.enu, added, strict=True):
         rows = torch.autograd.functional.jacobian(lambda standing, enu=enu: moved(standing, enu), 0 * root[0])
         torch.testing.assert_close(more, rows @ root @ root.T @ rows.T, rtol=1e-6, atol=1e-6)
@@ -155,7 +155,7 @@ def test_refraction_lowers_the_point() -> None:
 def test_refraction_of_standard_air_is_the_default() -> None:
     """k = 0.13 ± 0.1: the up component alone moves, and what is not known of k is added to its variance."""
     left, right = RIG(spread_points(tensor(300.0, 1000.0, 5000.0)))[0].unbind(-2)
-    straight, found = localizer()(left, right), Localizer(RIG, origin=ORIGIN, **ATTITUDE)(left, right)
+    straight, found = localizer()(left, right), standing(RIG, origin=ORIGIN, **ATTITUDE)(left, right)
     bend = straight.enu[:, :2].square().sum(-1) / (2 * 6.371e6)
     torch.testing.assert_close(found.enu[:, :2], straight.enu[:, :2], rtol=0, atol=0)
     torch.testing.assert_close(straight.enu[:, 2] - found.enu[:, 2], 0.13 * bend, rtol=5e-3, atol=0)
@@ -179,7 +179,7 @@ def test_heights_are_inside_their_intervals_where_light_bends() -> None:
     k = 0.13 + 0.1 * torch.randn(len(enu), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     seen = enu + torch.stack([0 * k, 0 * k, k * enu[:, :2].square().sum(-1) / (2 * 6.371e6)], -1)
     left, right = RIG(seen @ enu_from_cam(*ATTITUDE.values()))[0].unbind(-2)
-    found = Localizer(RIG, origin=ORIGIN, **ATTITUDE, pixel_sigma=0.05)(
+    found = standing(RIG, origin=ORIGIN, **ATTITUDE, pixel_sigma=0.05)(
         left + noise(0.05, 400, 2), right + noise(0.05, 400, 2, seed=4)
     )
     error = (found.enu - enu)[:, 2] / found.covariance[:, 2, 2].sqrt()
@@ -206,7 +206,7 @@ def test_rounded_covariances_are_accepted() -> None:
     """A matrix may be symmetric to rounding only, and have zeros."""
     cov = torch.diag(tensor(0.09, 0.04, 0.09, 0.04))
     cov[0, 2], cov[2, 0] = 0.01, 0.01 * (1 + 1e-12)
-    localize = Localizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)
+    localize = Localizer(pinhole_rig().placed(origin=ORIGIN, heading_deg=0.0))
     left, right = tensor([980.0, 540.0], [980.0, 540.0]), tensor([970.0, 540.0], [970.0, 540.0])
     crooked = cov.clone()
     crooked[2, 0] = 0.02
@@ -222,7 +222,7 @@ def test_statuses_and_no_nan_in_values_or_gradients() -> None:
     cov.requires_grad_()
     mask = torch.ones(len(BAD), dtype=torch.bool)
     mask[7] = False
-    found = Localizer(pinhole_rig(), origin=ORIGIN, heading_deg=0.0)(left, right, cov, mask)
+    found = Localizer(pinhole_rig().placed(origin=ORIGIN, heading_deg=0.0))(left, right, cov, mask)
     assert [PositionStatus(s).name for s in found.status.tolist()] == [row[2].name for row in BAD]
     for name, value in found._asdict().items():
         assert not torch.isnan(value).any(), name
@@ -318,13 +318,13 @@ def test_agrees_with_triangulate() -> None:
 def test_sensitivities() -> None:
     rig = pinhole_rig(1600.0, 10.0)
     left, right = rig(tensor([0.0, 0.0, 5000.0], [0.0, 0.0, 1000.0]))[0].unbind(-2)
-    slopes = Localizer(rig, origin=ORIGIN, heading_deg=0.0).sensitivity(left, right)
+    slopes = Localizer(rig.placed(origin=ORIGIN, heading_deg=0.0)).sensitivity(left, right)
     # Z² / (f b) m/px, and Z² / b m/rad: 436 m for 0.01° at 5 km.
     assert slopes.meters_per_pixel.tolist() == pytest.approx([1562.5, 62.5], rel=1e-3)
     assert slopes.meters_per_degree.tolist() == pytest.approx([43_633, 1745.3], rel=1e-3)
     # By turning the rig and locating again.
     turned_rig = Rig.pair(rig.left, rig.right, turned(1e-4), rig.right_from_left_translation)
-    module = Localizer(turned_rig, origin=ORIGIN, heading_deg=0.0)
+    module = Localizer(turned_rig.placed(origin=ORIGIN, heading_deg=0.0))
     moved = module(left, right).enu.norm(dim=-1) - tensor(5000.0, 1000.0)
     assert moved.abs().tolist() == pytest.approx([4.3633, 0.17453], rel=2e-3)
 
@@ -345,7 +345,7 @@ def test_a_detector_is_trained_through_it() -> None:
         crops.append(torch.exp(-((grid - u) ** 2 + (grid[:, None] - v) ** 2) / 8.0))
     images = torch.stack(crops, 1).reshape(32, 1, 33, 33) + 0.02 * torch.rand(32, 1, 33, 33)
     net = torch.nn.Sequential(torch.nn.Conv2d(1, 4, 5, padding=2), torch.nn.ReLU(), torch.nn.Conv2d(4, 1, 5, padding=2))
-    module = Localizer(rig, origin=ORIGIN, heading_deg=0.0)
+    module = Localizer(rig.placed(origin=ORIGIN, heading_deg=0.0))
     aim = truth @ enu_from_cam(0.0).T
 
     def located() -> Localization:

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from locate_rigs import located_pairs, real_rig, spread_points
+from locate_rigs import located_pairs, real_rig, spread_points, standing
 
-from kcal import FileError, InputError, Localizer, Origin, PositionStatus, save_rig
+from kcal import FileError, InputError, Origin, PositionStatus, save_rig
 from kcal.cli.main import main
 from kcal.locate import marks, points, stereo, tables
 from kcal.locate.export import PositionWriter, write_positions
@@ -43,9 +43,9 @@ def pixels() -> torch.Tensor:
 def locator_of_everything() -> PointLocator:
     rig = real_rig()
     pose = torch.diag(torch.tensor([1e-5, 2e-5, 1e-5, 1e-3, 1e-3, 1e-3], dtype=torch.float64) ** 2)
-    return PointLocator(Localizer(
+    return PointLocator(standing(
         rig, origin=ORIGIN, heading_deg=200.0, pitch_deg=3.0, calibration=RigCovariance.of(rig, pose=pose),
-        mounting=mounting_covariance(origin_m=[0.1] * 3, attitude_deg=(0.01, 0.01, 0.02)),
+        covariance=mounting_covariance(origin_m=[0.1] * 3, attitude_deg=(0.01, 0.01, 0.02)),
     ))  # fmt: skip
 
 

@@ -116,12 +116,12 @@ def test_a_file_keeps_it_and_the_localizer_takes_it(tmp_path: Path) -> None:
     assert torch.equal(own.enu, loaded.enu)
     assert torch.equal(own.covariance, loaded.covariance)
     # Given anew, it replaces the rig's: here with the usual sigma, which is larger than what the landmarks left.
-    same = Localizer(rig, pixel_sigma=0.1, refraction=rig.mounting.refraction)(*pixels)
+    same = Localizer(rig.placed(refraction=rig.mounting.refraction), pixel_sigma=0.1)(*pixels)
     assert torch.equal(same.enu, own.enu)
     assert float(same.covariance[0, 2, 2]) > float(own.covariance[0, 2, 2])
     # Nothing found of it: the usual one.
     rig.mounting = Mounting(origin=ORIGIN, heading_deg=16.0)
-    usual, stated = Localizer(rig), Localizer(rig, refraction=0.13, refraction_sigma=0.1)
+    usual, stated = Localizer(rig), Localizer(rig.placed(refraction=0.13, refraction_sigma=0.1))
     assert torch.equal(usual(*pixels).enu, stated(*pixels).enu)
     assert torch.equal(usual(*pixels).covariance, stated(*pixels).covariance)
 

@@ -153,7 +153,7 @@ def test_a_stereo_rig_gives_the_same_positions_and_covariances(tmp_path: Path, m
         assert torch.allclose(found.range_high, other.range_high, atol=0.3)
     else:
         # Without a place on the Earth there are straight lines, in the left camera's frame.
-        other = Localizer(rig, origin=ORIGIN, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0)(left, right)
+        other = Localizer(rig.placed(origin=ORIGIN, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0))(left, right)
         turned = other.enu @ tensor([1, 0, 0], [0, 0, 1], [0, -1, 0])
         assert torch.allclose(found.enu, turned, atol=0.01)
     assert (found.enu.norm(dim=-1) - other.enu.norm(dim=-1)).abs().max() < 0.01

@@ -35,7 +35,7 @@ SITE = tracked_site()
 
 @pytest.fixture
 def page() -> Iterator[LiveMap]:
-    live = LiveMap(PointLocator(Localizer(SITE.rig, origin=SITE.origin, heading_deg=0.0)).located(), 0)
+    live = LiveMap(PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located(), 0)
     yield live
     live.close()
 
@@ -100,7 +100,7 @@ def test_fields_of_view_are_those_of_the_cameras(page: LiveMap) -> None:
 
 def test_nothing_jumps_at_the_antimeridian() -> None:
     site = tracked_site(origin=Origin(lat=10.0, lon=179.9999, height=0.0), heading_deg=90.0)
-    live = LiveMap(PointLocator(Localizer(site.rig, origin=site.origin, heading_deg=90.0)).located(), 0)
+    live = LiveMap(PointLocator(Localizer(site.rig.placed(origin=site.origin, heading_deg=90.0))).located(), 0)
     left, right = site.rig(torch.tensor([[0.0, 0.0, 500.0]]).double())[0].unbind(-2)
     live.show(track_columns(Tracker(site, TrackOptions(confirm_hits=1))(pairs_of(left, right, 1.0)), 1), 1, 1.0)
     told = events(live, 3)
@@ -230,7 +230,7 @@ def test_names_cover_neither_each_other_nor_dots(width: int, height: int) -> Non
 
 
 def serve(answer: Any) -> None:
-    page = LiveMap(PointLocator(Localizer(SITE.rig, origin=SITE.origin, heading_deg=0.0)).located(), 0)
+    page = LiveMap(PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located(), 0)
     answer.send(page.address)
     answer.recv()
 

@@ -44,7 +44,7 @@ def test_from_boxes_to_ranges() -> None:
     matched = pair_objects(site.rig, site.left, site.right, site.images, options=options)
     assert matched.category == ("object",) * 4
     assert matched.time[0].tolist() == [3.0, 3.04]
-    locate = Localizer(site.rig, origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+    locate = Localizer(site.rig.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0))
     truth = torch.linalg.vector_norm(site.points, dim=-1).reciprocal()
     sigmas = []
     for pairs in (by_boxes, matched):

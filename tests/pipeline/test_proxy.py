@@ -33,7 +33,7 @@ pytestmark = pytest.mark.skipif(not (NGINX and OPENSSL), reason="nginx and opens
 def served(tmp_path: Path) -> Iterator[tuple[str, str]]:
     """The address of the web server, and the token of the map behind it."""
     site = tracked_site()
-    live = LiveMap(PointLocator(Localizer(site.rig, origin=site.origin, heading_deg=0.0)).located(), 0)
+    live = LiveMap(PointLocator(Localizer(site.rig.placed(origin=site.origin, heading_deg=0.0))).located(), 0)
     port = re.search(r":(\d+)/#", live.address).group(1)
     command = [OPENSSL, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-subj", "/CN=map.example.org", "-days", "2"]
     subprocess.run([*command, "-keyout", "map.key", "-out", "map.crt"], cwd=tmp_path, check=True, capture_output=True)

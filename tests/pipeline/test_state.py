@@ -25,7 +25,9 @@ def localizer(lens: str, scale: float, heading: float) -> Localizer:
     rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0 * scale, 0.1, 0.2]))
     rig.covariance = RigCovariance.of(rig, pose=scale * 1e-8 * torch.eye(6, dtype=torch.float64))
     mounting = scale * 1e-6 * torch.eye(6, dtype=torch.float64)
-    return Localizer(rig, origin=Origin(lat=19.0, lon=72.0, height=14.0), heading_deg=heading, mounting=mounting)
+    return Localizer(
+        rig.placed(origin=Origin(lat=19.0, lon=72.0, height=14.0), heading_deg=heading, covariance=mounting)
+    )
 
 
 @pytest.mark.parametrize("lens", ["opencv5", "ext24", "fisheye4", "hybrid"])

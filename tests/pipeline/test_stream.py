@@ -62,7 +62,7 @@ def read(line: bytes) -> Moment:
 
 
 def new_stream(folder: Path, **options: object) -> Stream:
-    run = PointLocator(Localizer(SITE.rig, origin=SITE.origin, heading_deg=0.0)).located()
+    run = PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located()
     tracker = Tracker(SITE, clock=ClockPrior(offset_sigma_s=0.02))
     outputs = [folder / "tracks.geojsonl", folder / "tracks.csv", folder / "tracks.cot"]
     return Stream(tracker, run, outputs, folder / "journal", **options)  # type: ignore[arg-type]
@@ -210,7 +210,7 @@ class _Slow:
 
 def test_a_journal_of_something_else(whole: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
     new_stream(tmp_path).follow(lines_of(whole[0], read), waits=True, resumes=True)
-    run = PointLocator(Localizer(SITE.rig, origin=SITE.origin, heading_deg=0.0)).located()
+    run = PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located()
     outputs = [tmp_path / "tracks.geojsonl", tmp_path / "tracks.csv", tmp_path / "tracks.cot"]
     with pytest.raises(FileError, match="other outputs"):
         Stream(Tracker(SITE), run, outputs[:1], tmp_path / "journal")
@@ -321,7 +321,7 @@ def test_impossible_addresses(wrong: str) -> None:
 
 
 def test_outputs_that_cannot_grow(tmp_path: Path) -> None:
-    run = PointLocator(Localizer(SITE.rig, origin=SITE.origin, heading_deg=0.0)).located()
+    run = PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located()
     with pytest.raises(InputError, match="output of a stream"):
         Stream(Tracker(SITE), run, [tmp_path / "a.kml"],
                tmp_path / "journal")  # fmt: skip
@@ -340,7 +340,7 @@ def line_at(seen_s: float, stamp: float) -> bytes:
 
 
 def new_timed_stream(folder: Path) -> Stream:
-    run = PointLocator(Localizer(SITE.rig, origin=SITE.origin, heading_deg=0.0)).located()
+    run = PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located()
     return Stream(Tracker(SITE), run, [folder / "tracks.csv"], folder / "journal")
 
 
@@ -469,12 +469,13 @@ def test_one_process_at_a_time_writes_an_output(tmp_path: Path) -> None:
         for journal in ("journal", "other"):
             with pytest.raises(FileError, match=rf"tracks\.csv: kcal live, process {child.pid}, since 20.* writes it"):
                 Stream(
-                    Tracker(SITE), PointLocator(Localizer(SITE.rig, origin=SITE.origin, heading_deg=0.0)).located(),
+                    Tracker(SITE),
+                    PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located(),
                     [tmp_path / "tracks.csv"], tmp_path / journal,
                 )  # fmt: skip
         with pytest.raises(FileError, match=r"journal: kcal live, process"):
             Stream(
-                Tracker(SITE), PointLocator(Localizer(SITE.rig, origin=SITE.origin, heading_deg=0.0)).located(),
+                Tracker(SITE), PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located(),
                 [tmp_path / "other.csv"], tmp_path / "journal",
             )  # fmt: skip
         assert (tmp_path / "tracks.csv").read_bytes() == b"row\n"

@@ -13,6 +13,7 @@ from locate_rigs import real_rig, tensor
 from track_scenes import ORIGIN, pairs_of, seen_by, tracked_site, yawed_rig
 
 from kcal import InputError, Localizer
+from kcal.gaussian import half_of_covariance
 from kcal.locate.tables import NUMBERS, TEXTS
 from kcal.pipeline.estimates import track_states
 from kcal.pipeline.imm_filter import Motion, Timing, born
@@ -30,10 +31,10 @@ def test_one_sighting_is_what_the_localizer_says() -> None:
     mix = torch.randn(12, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     scale = tensor(*[2e-5] * 3, *[5e-3] * 3, *[0.02] * 3, *[3e-5] * 3)
     whole = (scale[:, None] * mix) @ (scale[:, None] * mix).T / 12.0
-    known = RigCovariance.of(rig, pose=whole[:6, :6])
-    link = torch.cat([torch.zeros(len(known.matrix) - 6, 6, dtype=torch.float64), whole[:6, 6:]])
-    localize = Localizer(rig, origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, calibration=known,
-                               mounting=whole[6:, 6:], link=link)  # fmt: skip
+    there = rig.placed(origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5)
+    linked = torch.nn.functional.pad(half_of_covariance(whole), (sum(rig.sizes), 1))
+    there.relative_root = torch.cat([there.relative_root, linked])
+    localize = Localizer(there)
     points = tensor([10.0, -3.0, 120.0], [-150.0, 20.0, 900.0], [300.0, 60.0, 2500.0], [0.0, 40.0, 90_000.0])
     left, right = rig(points)[0].unbind(-2)
     pairs = pairs_of(left, right + tensor([0.0, 0.4]), 7.0)
@@ -164,7 +165,8 @@ def test_the_effect_of_a_calibration_error_is_that_of_making_it() -> None:
     rig = tracked_site().rig
     covariance = torch.zeros(5, 5, dtype=torch.float64)
     covariance[0, 0] = 1.0
-    localize = Localizer(rig, origin=ORIGIN, heading_deg=0.0, calibration=RigCovariance.of(rig, right=covariance))
+    rig.covariance = RigCovariance.of(rig, right=covariance)
+    localize = Localizer(rig.placed(origin=ORIGIN, heading_deg=0.0))
     found = []
     for error in (0.0, 0.05):
         tracker = Tracker(localize, TrackOptions(motions=(Motion(acceleration=3.0),), confirm_hits=1))

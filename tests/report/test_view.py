@@ -65,7 +65,7 @@ def targets(**options: Any) -> Located:
 
 
 def standing() -> Localizer:
-    return Localizer(real_rig(), origin=ORIGIN, heading_deg=35.0, pitch_deg=-2.0, pixel_sigma=0.1)
+    return Localizer(real_rig().placed(origin=ORIGIN, heading_deg=35.0, pitch_deg=-2.0), pixel_sigma=0.1)
 
 
 def test_border_rays_are_those_of_the_lens(tmp_path: Path) -> None:

@@ -84,15 +84,18 @@ def test_a_relocked_rig_stands_as_it_was_found() -> None:
     )
     torch.testing.assert_close(new.right_from_left_rotation, found.rig.right_from_left_rotation, rtol=0, atol=0)
     torch.testing.assert_close(new.right_from_left_translation, found.rig.right_from_left_translation, rtol=0, atol=0)
-    assert torch.equal(rig.mounting.covariance, STANDING)
+    torch.testing.assert_close(rig.mounting.covariance, STANDING, rtol=1e-12, atol=1e-24)
 
 
-def test_an_exact_mounting_stays_exact_and_none_is_refused() -> None:
+def test_an_exact_mounting_gets_the_errors_of_the_check_and_none_is_refused() -> None:
     rig = standing_rig(covariance=None)
     marks = eastward(rig, tensor(0.0, math.radians(0.02), 0.0))
-    new = check_rig(rig, landmarks=marks).relocked("Monday")
+    found = check_rig(rig, landmarks=marks)
+    new = found.relocked("Monday")
     assert new.mounting is not None
-    assert new.mounting.covariance is None
+    x, y, z = found.left_covariance.diagonal().tolist()
+    errors = new.mounting.covariance.diagonal()[:6]
+    torch.testing.assert_close(errors, tensor(0.0, 0.0, 0.0, z, x, y), rtol=2e-3, atol=1e-15)
     assert new.mounting.heading_deg == pytest.approx(89.98, abs=1e-5)
     rig.mounting = None
     with pytest.raises(InputError, match="need the left camera's pose"):

@@ -32,7 +32,7 @@ def located(layer: CalibrationLayer, corners: tuple[Tensor, Tensor], start: list
     turn = right.cam_from_board_rotation[0] @ left.cam_from_board_rotation[0].mT
     shift = right.cam_from_board_translation[0] - turn @ left.cam_from_board_translation[0]
     rig = Rig.pair(left.camera(differentiable=True), right.camera(differentiable=True), turn, shift)
-    localize = Localizer(rig, origin=Origin(lat=45.0, lon=6.0, height=0.0), heading_deg=0.0)
+    localize = Localizer(rig.placed(origin=Origin(lat=45.0, lon=6.0, height=0.0), heading_deg=0.0))
     pixels = [torch.tensor([[330.0, 250.0]], dtype=torch.float64), torch.tensor([[300.0, 238.0]], dtype=torch.float64)]
     where = localize(*pixels)
     return torch.cat([where.enu[0], where.inverse_range])

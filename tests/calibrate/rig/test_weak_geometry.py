@@ -96,14 +96,15 @@ class TestWidened:
         for seed in (0, 23, 24, 26):
             found = solved(surveyed(box((900.0, 450.0, 0.0), (0.0, 0.0, FAR), seed), seed))
             rig = found.stereo()
-            assert rig.covariance is not None
+            known = rig.covariance
+            assert known is not None
             (text,) = found.warnings
             assert "intervals were widened" in text
             assert "nearly in one plane" in text
             inside = []
             for widen in (1.0, 1.0 / math.sqrt(found.variance)):
-                known = RigCovariance(half=widen * rig.covariance.half)
-                localize = Localizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1, calibration=known)
+                rig.covariance = RigCovariance(half=widen * known.half)
+                localize = Localizer(rig.placed(origin=ORIGIN, heading_deg=0.0), pixel_sigma=0.1)
                 answer = localize(*(value[both] for value in pixels))
                 good = (answer.range_low <= far[both]) & (far[both] <= answer.range_high)
                 inside.append(float(good.double().mean()))
@@ -142,7 +143,7 @@ class TestOrdinary:
         rig = found.stereo()
         targets = _targets(found._solution, 0, 1, 1.0 / 200.0)
         assert targets is not None
-        localize = Localizer(rig, origin=ORIGIN, heading_deg=0.0, pixel_sigma=0.1)
+        localize = Localizer(rig.placed(origin=ORIGIN, heading_deg=0.0), pixel_sigma=0.1)
         for far in (200.0, 370.0, 900.0, 5000.0):
             pixels, good = rig(far * targets.rays)
             (left, right), good = pixels.unbind(-2), good.all(-1)
