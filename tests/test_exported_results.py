@@ -17,7 +17,8 @@ from locate_rigs import pinhole_rig
 from torch import Tensor, nn
 
 import kcal
-from kcal.lens.rig import Origin, RigCovariance
+from kcal.lens.pair_errors import RigCovariance
+from kcal.lens.rig import Origin
 from kcal.locate.localizer import Localizer
 
 

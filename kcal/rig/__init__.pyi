@@ -26,7 +26,7 @@ from kcal.locate.moving import match_moving as match_moving
 
 # Place and plan rigs
 from kcal.lens.rig import Mounting as Mounting
-from kcal.lens.rig import RigCovariance as RigCovariance
+from kcal.lens.pair_errors import RigCovariance as RigCovariance
 from kcal.locate.mounting import placed_rig as placed_rig
 from kcal.locate.mounting import mounting_covariance as mounting_covariance
 from kcal.locate.budget import planned_rig as planned_rig

@@ -16,9 +16,10 @@ import torch
 from kornia.geometry.epipolar import triangulate_points
 from torch import Tensor
 
+from kcal.lens.pair_errors import RigCovariance
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
-from kcal.lens.rig import Origin, Rig, RigCovariance
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.angular import triangulate_linear, triangulate_pairs
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.localizer import Localizer

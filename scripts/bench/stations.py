@@ -25,7 +25,8 @@ from torch import Tensor
 from kcal import Board, Camera, Localizer, Observations, RigData, View, calibrate_camera, save_rig, solve_rig
 from kcal.calibrate.rig.pairs import boards_of_several
 from kcal.lens import rotation_from_vector
-from kcal.lens.rig import Mounting, Origin, Rig, RigCovariance
+from kcal.lens.pair_errors import RigCovariance
+from kcal.lens.rig import Mounting, Origin, Rig
 from kcal.locate import terrain
 from kcal.locate.siting import Site, area_of, rank_sites, siting_map
 from kcal.rig import planned_rig

@@ -22,7 +22,8 @@ from kcal.finding import Finding, sentences
 from kcal.io.rig_file import save_rig
 from kcal.lens.calibration import Exclusion, ItemResidual, RigCalibration, RigSource
 from kcal.lens.camera import Camera
-from kcal.lens.rig import Origin, Rig, RigCovariance
+from kcal.lens.pair_errors import RigCovariance
+from kcal.lens.rig import Origin, Rig
 from kcal.solve.lm import LMOptions, SolverStatus
 from kcal.texts import brief
 
