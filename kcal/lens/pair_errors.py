@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,9 +12,6 @@ from kcal.checks import as_covariance
 from kcal.errors import InputError
 from kcal.gaussian import half_of_covariance
 from kcal.texts import brief
-
-if TYPE_CHECKING:
-    from kcal.lens.rig import Rig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,6 +27,7 @@ class RigCovariance:
             nothing where coefficients are hardly determined one by one and their sum is.
 
     Example:
+        >>> from kcal import Camera, Rig
         >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
         >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
         >>> sigma = torch.tensor([0, 1e-4, 0, 0, 0, 0], dtype=torch.float64)  # relative yaw
@@ -45,7 +43,7 @@ class RigCovariance:
     @classmethod
     def of(
         cls,
-        rig: Rig,
+        rig: Any,
         *,
         left: Tensor | None = None,
         right: Tensor | None = None,
@@ -58,7 +56,7 @@ class RigCovariance:
         that was seen. Parts of a joint covariance taken as independent give intervals that are far too wide.
 
         Args:
-            rig: the rig that they belong to.
+            rig: the `Rig` of two cameras that they belong to.
             left: of the left camera's parameters, (5 + P, 5 + P).
             right: of the right camera's.
             pose: (6, 6) of the relative pose.

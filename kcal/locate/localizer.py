@@ -101,6 +101,7 @@ class Localizer(Operations, Movable, StatedModule):
 
     Example:
         >>> from kcal import Camera
+        >>> from kcal.locate import enu_from_cam
         >>> camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
         >>> rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
         >>> there = rig.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
@@ -285,8 +286,7 @@ class Localizer(Operations, Movable, StatedModule):
             >>> import tempfile
             >>> from kcal import save_rig
             >>> from kcal.rig import planned_rig
-            >>> rig = planned_rig()
-            >>> rig.mounting = Mounting(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
+            >>> rig = planned_rig().placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=0.0)
             >>> with tempfile.TemporaryDirectory() as folder:
             ...     localize = Localizer.from_file(save_rig(rig, Path(folder, "rig.json")), pixel_sigma=0.1)
             >>> localize.origin

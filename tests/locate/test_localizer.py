@@ -383,7 +383,7 @@ def test_bad_arguments() -> None:
         ({"refraction": 13.0}, "refraction"),
         ({"refraction_sigma": -0.1}, "refraction_sigma"),
         ({"refraction_sigma": math.nan}, "refraction_sigma"),
-        ({"mounting": torch.eye(3)}, "mounting"),
+        ({"covariance": torch.eye(3)}, "mounting"),
         ({"calibration": RigCovariance(half=torch.eye(3))}, "joint covariance"),
         ({"heading_deg": math.nan}, "heading"),
     ):
