@@ -240,7 +240,7 @@ def _from_two(content: dict[str, Any]) -> dict[str, Any]:
         owned = {name: stands[name] for name in ("covariance", "link") if stands.get(name) is not None}
         more["mounting"] = {k: v for k, v in stands.items() if k not in ("covariance", "link") and v is not None}
     try:
-        lenses = sum(len(camera["coefficients"]) + len(INTRINSICS) for camera in cameras)  # type: ignore[index]
+        lenses = sum(len(camera["coefficients"]) + len(INTRINSICS) for camera in cameras)  # type: ignore[index, misc]
         turn, shift = (torch.tensor(pose[part], dtype=torch.float64) for part in ("rotation", "translation"))
         center = torch.stack([torch.zeros_like(shift), -turn.T @ shift])
         look = RigMounting(**more["mounting"]).mounting().enu_from_cam if stands else torch.eye(3, dtype=torch.float64)
