@@ -248,11 +248,10 @@ def _from_two(content: dict[str, Any]) -> dict[str, Any]:
         # What is wrong with it is told by the checks of the fields.
         pass
     else:
-        fits = not isinstance(half, dict) or list(half.get("shape", ()))[1:] == [lenses + 6]
-        joint = _joint_errors(lenses + 6, half, owned if stands else None) if fits else ()
-        if not fits:
+        if isinstance(half, dict) and list(half.get("shape", ()))[1:] != [lenses + 6]:
+            # Of other cameras: the checks say so.
             more["root"] = half
-        elif len(joint):
+        elif len(joint := _joint_errors(lenses + 6, half, owned if stands else None)):
             root = joint @ by_relative(lenses, center, turn, look, back=True).T
             more["root"] = Packed.of(root).model_dump()
     still = {"rotation": torch.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
