@@ -63,6 +63,7 @@ def assert_equal(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> None:
         torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_localizer_compiles_in_seconds_for_all_shapes() -> None:
     """With the real compiler; unrolled it has some 25,000 steps."""
     module = localizer()

@@ -119,6 +119,7 @@ def test_what_forks_is_seen(code: str) -> None:
     assert list(forks(ast.parse(code)))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="work is read from /proc")
 def test_a_test_that_waits_is_ended_and_one_that_works_is_not(tmp_path: Path) -> None:
     (tmp_path / "conftest.py").write_text((ROOT / "tests/conftest.py").read_text())

@@ -166,6 +166,7 @@ def test_state_precision_and_shapes() -> None:
         other.load_state_dict(lookup.state_dict())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", ["project", "unproject"])
 def test_graphs(direction: str, tmp_path: Path) -> None:
     torch.compiler.reset()

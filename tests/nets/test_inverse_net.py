@@ -223,6 +223,7 @@ class TestModule:
         assert torch.equal(other(points), wanted)
         assert {t.dtype for t in (*other.parameters(), *other.buffers())} == {torch.float64}
 
+    @pytest.mark.slow
     def test_compiles_as_one_graph(self) -> None:
         torch.compiler.reset()
         camera, fit = trained("opencv14")
@@ -233,6 +234,7 @@ class TestModule:
         assert torch.equal(valid, wanted[1])
         torch.testing.assert_close(rays, wanted[0], rtol=0, atol=1e-12)
 
+    @pytest.mark.slow
     def test_the_guess_runs_as_onnx(self, tmp_path: Path) -> None:
         """The rest of the graph is that of `Unproject` without a net."""
 

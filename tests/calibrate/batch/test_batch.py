@@ -210,6 +210,7 @@ class TestResults:
         assert "at least 3" in by_name["few"].error
         assert not (place / "out" / "few.camera.json").exists()
 
+    @pytest.mark.slow
     def test_an_unexpected_error_is_listed_and_not_kept(self, folder, place, monkeypatch):
         monkeypatch.setattr("kcal.calibrate.batch.jobs.detect_board", lambda *_: 1 / 0)
         rows, _ = run(folder, place / "new")
@@ -391,6 +392,7 @@ def test_command_line(folder, place, monkeypatch):
     assert not (place / "none").exists()
 
 
+@pytest.mark.slow
 def test_only_the_lines_of_finished_cameras_are_kept(folder, place):
     """Unless they measure a board together."""
     for model, kept in (("pinhole", 0), ("hybrid", 2)):
