@@ -235,10 +235,10 @@ def calibration_options(model: str, options: BatchOptions) -> CalibrationOptions
     return CalibrationOptions(model=model, board_warp=options.board_warp)
 
 
-def calibrate_again(seen: Observations, options: BatchOptions) -> CameraCalibrationResult:
-    """One camera with the hybrid lens, with all that its calibration tells."""
+def calibrate_again(seen: Observations, options: BatchOptions, model: str = HYBRID) -> CameraCalibrationResult:
+    """One camera, with all that its calibration tells."""
     with work_limit(options.time_limit):
-        return calibrate_camera(seen, calibration_options(HYBRID, options))
+        return calibrate_camera(seen, calibration_options(model, options))
 
 
 def calibrated(result: CameraCalibrationResult, name: str) -> Calibrated:
@@ -248,9 +248,7 @@ def calibrated(result: CameraCalibrationResult, name: str) -> Calibrated:
 
 def calibrate_observations(seen: Observations, name: str, model: str, options: BatchOptions) -> Calibrated:
     """Calibrate one camera."""
-    with work_limit(options.time_limit):
-        try:
-            result = calibrate_camera(seen, calibration_options(model, options))
-        except KcalError as error:
-            return Calibrated(error=str(error))
-        return calibrated(result, name)
+    try:
+        return calibrated(calibrate_again(seen, options, model), name)
+    except KcalError as error:
+        return Calibrated(error=str(error))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcal.calibrate.camera.checks import MINIMUM_VIEWS, copied_views, copy_findings, pose_findings, unusable_views
 from kcal.calibrate.camera.hybrid import (
+    among_all,
     calibrate_hybrid,
     calibrate_what_fits,
     hybrid_result,
@@ -22,7 +23,6 @@ from kcal.calibrate.camera.result import (
     CalibrationOptions,
     CameraCalibrationResult,
     Progress,
-    Rejected,
     SharedBoard,
 )
 from kcal.calibrate.camera.solve import calibrate_parametric
@@ -231,22 +231,11 @@ def _complete(
     result: CameraCalibrationResult, observations: Observations, copied: Mapping[int, int]
 ) -> CameraCalibrationResult:
     """A result without copies as one for all observations, with doubts about views that add nothing."""
-    pixels, names = observations.pixels(), observations.names
+    names = observations.names
     more = (*copy_findings(names, copied), *pose_findings(result.observations.pixels()), *unit_findings(result))
-    findings = (*result.findings, *more)
-    kept = [i for i in range(len(names)) if i not in copied]
-    left_out = tuple(
-        Rejected(
-            view=names[i],
-            corners=int(torch.isfinite(pixels[i]).all(-1).sum()),
-            residual=float(result.per_view_rms[kept.index(first)]),
-            reason=f"it is a copy of {names[first]}",
-        )
-        for i, first in copied.items()
-    )
-    if left_out:
-        result = result.among(kept, observations)
-    return dataclasses.replace(result, findings=findings, rejected_views=(*result.rejected_views, *left_out))
+    residuals = dict(zip((i for i in range(len(names)) if i not in copied), result.per_view_rms.tolist(), strict=True))
+    without = {i: (f"it is a copy of {names[first]}", residuals[first]) for i, first in copied.items()}
+    return among_all(dataclasses.replace(result, findings=(*result.findings, *more)), observations, without)
 
 
 def _calibrate(observations: Observations, options: CalibrationOptions, progress: Progress) -> CameraCalibrationResult:

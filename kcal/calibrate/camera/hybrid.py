@@ -348,16 +348,21 @@ def without_views(
     """A result without some views as one for all `observations`, with a doubt that names them."""
     if not wrong:
         return result
-    kept = [i for i in range(len(observations.views)) if i not in wrong]
-    counts = torch.isfinite(observations.pixels()).all(-1).sum(-1).tolist()
-    left_out = tuple(
-        Rejected(view=observations.names[i], corners=counts[i], residual=float("nan"), reason=why)
-        for i, why in wrong.items()
-    )
     text = f"{len(wrong)} of {len(observations.views)} views were left out: {listed_views(observations, wrong)}"
     note = Finding("excluded", "doubt", text, "look at these images, and remove or retake them")
-    return dataclasses.replace(
-        result.among(kept, observations),
-        findings=(note, *result.findings),
-        rejected_views=(*result.rejected_views, *left_out),
-    )
+    result = dataclasses.replace(result, findings=(note, *result.findings))
+    return among_all(result, observations, {i: (why, math.nan) for i, why in wrong.items()})
+
+
+def among_all(
+    result: CameraCalibrationResult, observations: Observations, without: Mapping[int, tuple[str, float]]
+) -> CameraCalibrationResult:
+    """A result without some views as one for all `observations`; of each such view, why, and its residual in pixels."""
+    kept = [i for i in range(len(observations.views)) if i not in without]
+    counts = torch.isfinite(observations.pixels()).all(-1).sum(-1).tolist()
+    left_out = [
+        Rejected(view=observations.names[i], corners=counts[i], residual=residual, reason=why)
+        for i, (why, residual) in without.items()
+    ]
+    rejected = (*result.rejected_views, *left_out)
+    return dataclasses.replace(result.among(kept, observations), rejected_views=rejected) if left_out else result

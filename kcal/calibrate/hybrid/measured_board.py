@@ -110,18 +110,15 @@ def printed_prior(modes: BoardModes, amplitudes: Tensor) -> Gaussian:
     return Gaussian.independent(numbered(BOARD_SLOT, len(sigma)), torch.zeros_like(sigma), sigma)
 
 
-def printed_board(
-    modes: BoardModes, messages: Sequence[Gaussian], hyperprior: Hyperprior | None = None
-) -> tuple[Gaussian, float]:
+def printed_board(modes: BoardModes, messages: Sequence[Gaussian]) -> tuple[Gaussian, float]:
     """The prior of a printed board whose amplitudes maximize the evidence of all messages, and its logarithm.
 
     Args:
         modes: of the board.
         messages: of the cameras that saw it.
-        hyperprior: of the amplitudes; the typical one if not given.
     """
-    prior, unit = hyperprior or typical_hyperprior(), modes.unit
-    prior = Hyperprior(prior.mean[BOARD:], prior.sd[BOARD:])
+    typical, unit = typical_hyperprior(), modes.unit
+    prior = Hyperprior(typical.mean[BOARD:], typical.sd[BOARD:])
     zero, none = torch.zeros_like(unit), torch.full_like(modes.family, -1)
     families = PriorFamilies(zero, unit.log(), modes.family, none, zero)
     data = still_data(stacked(messages).placed(numbered(BOARD_SLOT, len(unit)), zero).rows.T[None], zero, 0.0)

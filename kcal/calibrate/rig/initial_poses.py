@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.pairs import SeenAlone, check_cameras, half_turn, pose_alone, refuse_wrong_pairs
+from kcal.calibrate.rig.pairs import check_cameras, half_turn, pose_alone, refuse_wrong_pairs
 from kcal.calibrate.rig.resection import consensus_rotation, distinct_poses
 from kcal.calibrate.rig.source import Start, as_items
 from kcal.calibrate.rig.sources import Boards, RigData
@@ -206,7 +206,7 @@ class InitialPoses:
         self.foreign: dict[int, str] = {}
         self._alone: list[Pose] = []
         self._compared: set[tuple[int, int]] = set()
-        alone = list[SeenAlone]()
+        alone = list[tuple[Pose, Tensor]]()
         self._good = torch.zeros(0, len(data.cameras), dtype=torch.bool)
         boards = data.boards
         if boards is None:
@@ -219,9 +219,9 @@ class InitialPoses:
             if bool(enough.any()):
                 found, rms[enough] = pose_alone(points, boards.pixels[enough, c], camera, solver)
                 rotation[enough], translation[enough] = found.rotation, found.translation
-            alone.append(SeenAlone(Pose(rotation, translation), rms))
+            alone.append((Pose(rotation, translation), rms))
         check_cameras(data, self._good, alone, solver)
-        self._alone = [one.poses for one in alone]
+        self._alone = [poses for poses, _ in alone]
 
     def link(self, known: _Known, waiting: list[int]) -> bool:
         """Place the waiting camera that shares the most boards with one that is placed."""

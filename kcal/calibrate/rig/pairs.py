@@ -9,7 +9,6 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -296,30 +295,18 @@ def _median_rms(rms: Tensor) -> float:
     return float(rms.median().nan_to_num(math.inf)) if len(rms) else 0.0
 
 
-class SeenAlone(NamedTuple):
-    """What one camera alone makes of the boards that it sees well.
-
-    Attributes:
-        poses: (V,) of all boards, NaN for others.
-        rms: (V,) px of each view; NaN for others.
-    """
-
-    poses: Pose
-    rms: Tensor
-
-
-def check_cameras(data: RigData, good: Tensor, alone: Sequence[SeenAlone], solver: LMOptions) -> None:
+def check_cameras(data: RigData, good: Tensor, alone: Sequence[tuple[Pose, Tensor]], solver: LMOptions) -> None:
     """Refuse cameras that do not fit their boards, or that fit each other's boards clearly better.
 
     Args:
         data: with boards.
         good: (V, C) which boards each camera sees well.
-        alone: what each camera makes of these.
+        alone: what each camera makes of these (`pose_alone`), NaN for others.
         solver: options of the solver.
     """
     boards = data.boards
     assert boards is not None
-    rms = [_median_rms(one.rms[good[:, c]]) for c, one in enumerate(alone)]
+    rms = [_median_rms(own[good[:, c]]) for c, (_, own) in enumerate(alone)]
     for name, camera, own in zip(data.names, data.cameras, rms, strict=True):
         record = None if camera.calibration is None else camera.calibration.record
         limit = _FOREIGN_RMS if record is None else min(_FOREIGN_RMS, max(_HARDLY, _MISFIT_TIMES * record.rms))
@@ -336,7 +323,7 @@ def check_cameras(data: RigData, good: Tensor, alone: Sequence[SeenAlone], solve
         swapped = []
         # The second of the two is seldom needed, and all views hardly ever.
         for a, b in (pair, pair[::-1]):
-            if not _may_fit(boards, a, good[:, a], alone[a], data.cameras[b]):
+            if not _may_fit(boards, a, good[:, a], *alone[a], data.cameras[b]):
                 break
             swapped.append(
                 _median_rms(pose_alone(boards.points, boards.pixels[good[:, a], a], data.cameras[b], solver)[1])
@@ -351,14 +338,14 @@ def check_cameras(data: RigData, good: Tensor, alone: Sequence[SeenAlone], solve
             )
 
 
-def _may_fit(boards: Boards, index: int, good: Tensor, alone: SeenAlone, camera: Camera) -> bool:
+def _may_fit(boards: Boards, index: int, good: Tensor, poses: Pose, rms: Tensor, camera: Camera) -> bool:
     """Whether another camera fits a few of the boards that one sees better than this one does."""
     which = good.nonzero()[:, 0]
     which = which[evenly(len(which), _FEW)]
     pixels = boards.pixels[which, index]
-    start = BoardState.flat(camera.params.detach(), *alone.poses.some(which))
+    start = BoardState.flat(camera.params.detach(), *poses.some(which))
     _, cost = refine_poses(Views(board_points=boards.points, pixels=pixels), camera.model, start, _ROUGH)
-    return _median_rms(_view_rms(pixels, cost)) < _median_rms(alone.rms[which])
+    return _median_rms(_view_rms(pixels, cost)) < _median_rms(rms[which])
 
 
 def evenly(count: int, most: int) -> Tensor:
