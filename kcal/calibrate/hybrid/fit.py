@@ -30,7 +30,6 @@ from kcal.calibrate.hybrid.fitted_views import (
     Rounds,
     columns_may_be_read,
     expected_estimate,
-    hybrid_problem,
     hybrid_unknowns,
     motion_is_worth,
     run_rounds,
@@ -443,20 +442,12 @@ class HybridFit:
         return self.state.motion[:, -BENDS:] @ self.readout.bends
 
     def problem(self, points: Tensor, pixels: Tensor, weights: Tensor, mean: Tensor, precision: Tensor) -> BoardProblem:
-        """The least-squares problem of this lens, board and motion, for given data and priors; see `hybrid_problem`."""
-        shapes = self.board_shapes.shapes
-        return hybrid_problem(
-            off_by(points, self.displaced),
-            shapes,
-            pixels,
-            weights,
-            self.model,
-            mean,
-            precision,
-            self.readout,
-            self.own_stillness,
-            self.square,
-        )
+        """The problem of this lens, board and motion, for given data and priors; see `FittedViews.problem_under`."""
+        views = FittedViews(
+            points=off_by(points, self.displaced), board=self.board_shapes, pixels=pixels, size=self.size,
+            weights=weights, hyperprior=typical_hyperprior(), readout=self.readout, square=self.square,
+        )  # fmt: skip
+        return views.problem_under(self.model, mean, precision, self.own_stillness)
 
     def residuals_of(self, pixels: Tensor) -> Tensor:
         """(V, N, 2) as `residuals`, of any corners of the same views; infinite where the lens has no image of one."""

@@ -60,46 +60,8 @@ def hybrid_unknowns(model: LensModel, square: bool = True) -> FreeParameters:
     return FreeParameters((0, 1, 2, 3, *rest), (0, rows, 1, 2, *(i - 2 for i in rest)))
 
 
-def hybrid_problem(
-    points: Tensor,
-    shapes: Tensor,
-    pixels: Tensor,
-    weights: Tensor,
-    model: LensModel,
-    mean: Tensor,
-    precision: Tensor,
-    readout: Readout | None = None,
-    stillness: Tensor | None = None,
-    square: bool = True,
-    turning: bool = False,
-    displaced: bool = False,
-) -> BoardProblem:
-    """Residuals of boards under a hybrid lens, with a normal prior on each unknown of lens and board.
-
-    Args:
-        points: (N, 3) the board's corners as ordered, meters.
-        shapes: (B, 3, N) modes of the board.
-        pixels: (V, N, 2), NaN where not seen.
-        weights: (V, N) by which residuals are multiplied.
-        model: of a hybrid lens.
-        mean: (S,) of the prior on the unknowns of the camera and on the board.
-        precision: (S,) its weight: the squared noise over the prior's variance. Infinite: held.
-        readout: how views move while they are read, and how the board bends in them; None: neither.
-        stillness: (M,) or (V, M) the squared noise over the variance of each of these numbers.
-        square: whether pixels are square; others have two focal lengths.
-        turning: points are (V, N, 3) and infinitely far, so that poses are rotations.
-        displaced: each corner is off its place by unknowns of its own, the last ones.
-    """
-    held = torch.isinf(precision)
-    return BoardProblem(
-        points, pixels, model, hybrid_unknowns(model, square), shapes=shapes, free_board=True, held=held,
-        weights=weights, terms=[hybrid_prior(model, mean, precision, square)], readout=readout, stillness=stillness,
-        turning=turning, displaced=displaced,
-    )  # fmt: skip
-
-
 def hybrid_prior(model: LensModel, mean: Tensor, precision: Tensor, square: bool = True) -> GaussianPrior:
-    """The prior of `hybrid_problem`."""
+    """The prior of `FittedViews.problem_under`."""
     leading, count, held = hybrid_unknowns(model, square).leading, 5 + model.size, torch.isinf(precision)
     board = torch.arange(count, count + len(mean) - len(leading))
     index = torch.cat([torch.tensor(leading), board])[~held]
@@ -238,6 +200,24 @@ class FittedViews:
         numbers = dict(zip(numbered(LENS_SLOT, len(leading)), leading, strict=True))
         return [GaussianTerm(torch.tensor([numbers[slot] for slot in self.known.slots]), self.known, 1.0)]
 
+    def problem_under(
+        self, model: LensModel, mean: Tensor, precision: Tensor, stillness: Tensor | None = None
+    ) -> BoardProblem:
+        """Residuals of boards under a hybrid lens, with a normal prior on each unknown of lens and board.
+
+        Args:
+            model: of a hybrid lens.
+            mean: (S,) of the prior on the unknowns of the camera and on the board.
+            precision: (S,) its weight: the squared noise over the prior's variance. Infinite: held.
+            stillness: (M,) or (V, M) the squared noise over the variance of each number of a view beside its pose.
+        """
+        return BoardProblem(
+            self.points, self.pixels, model, hybrid_unknowns(model, self.square), shapes=self.board.shapes,
+            free_board=True, held=torch.isinf(precision), weights=self.weights,
+            terms=[hybrid_prior(model, mean, precision, self.square)], readout=self.readout, stillness=stillness,
+            turning=self.turning, displaced=self.board.displaced,
+        )  # fmt: skip
+
     def problem(self, estimate: Estimate, held: Tensor | None = None) -> BoardProblem:
         """The least squares at amplitudes of an estimate, unknowns (S,) being held: those of `held` if not given."""
         never = self.held(estimate) if held is None else held
@@ -248,10 +228,8 @@ class FittedViews:
             # pixels from where they were read.
             problem = kept[0][2].read_as_shown(estimate.state, math.sqrt(estimate.amplitudes.variance))
         else:
-            problem = hybrid_problem(
-                self.points, self.board.shapes, self.pixels, self.weights, estimate.model, estimate.families.mean,
-                precision, self.readout, still, self.square, self.turning, self.board.displaced,
-            ).read_as_shown(estimate.state)  # fmt: skip
+            problem = self.problem_under(estimate.model, estimate.families.mean, precision, still)
+            problem = problem.read_as_shown(estimate.state)
         kept[:] = [(estimate.model, fixed, problem)]
         prior = hybrid_prior(estimate.model, estimate.families.mean, precision, self.square)
         problem = problem.with_priors([prior, *self._told(estimate.model)], still)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from calibrate_scenes import observe
+from hybrid_views import views_of
 from printed_boards import printed_points, printed_views
 from torch import Tensor
 
@@ -17,7 +18,6 @@ from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.hybrid.board_modes import board_modes, turned_corner_offsets, turned_corners
 from kcal.calibrate.hybrid.cameras_fit import CamerasFit, fit_cameras
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
-from kcal.calibrate.hybrid.fitted_views import hybrid_problem
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_board, off_by, save_measured_board
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
@@ -72,10 +72,9 @@ def problem(pixels: Tensor, found: HybridFit, precision: float = 0.0) -> tuple[B
     board = torch.cat([found.state.board, off.T.flatten()])
     count = len(found.half) + off.numel()
     weight = torch.full((count,), precision, dtype=torch.float64)
-    made = hybrid_problem(
-        BOARD.points, found.board_shapes.shapes, pixels, torch.ones_like(pixels[..., 0]), found.model, 0.0 * weight,
-        weight, displaced=True,
-    )  # fmt: skip
+    made = views_of(BOARD.points, found.board_shapes.with_corners(), pixels).problem_under(
+        found.model, 0.0 * weight, weight
+    )
     return made, found.state._replace(board=board, motion=found.state.motion[:, :0])
 
 

@@ -8,8 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from hybrid_views import views_of
 from scipy import integrate, stats
 
+from kcal.calibrate.hybrid.board_modes import BoardModes
 from kcal.calibrate.hybrid.evidence import (
     Amplitudes,
     EvidenceLoss,
@@ -22,7 +24,7 @@ from kcal.calibrate.hybrid.evidence import (
     view_data,
 )
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
-from kcal.calibrate.hybrid.fitted_views import hybrid_problem, hybrid_unknowns
+from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
 from kcal.calibrate.problem.state import AMPLITUDES, MEDIAN, MOTION, SPREAD
 from kcal.corners.board import Board
 from kcal.lens.model import HybridForm, LensModel
@@ -291,13 +293,13 @@ def test_square_pixels_have_one_focal_length() -> None:
 
 def test_priors_are_of_the_unknowns_that_are_not_held() -> None:
     board = Board(columns=4, rows=3, square=0.1)
-    shapes = torch.zeros(2, 3, board.corners, dtype=torch.float64)
+    modes = BoardModes(torch.zeros(2, 3, board.corners).double(), torch.ones(2).double(), torch.zeros(2).long())
     pixels = torch.zeros(1, board.corners, 2, dtype=torch.float64)
     count = 3 + SIZE + 2
     mean = torch.arange(count, dtype=torch.float64)
     precision = torch.full((count,), 4.0, dtype=torch.float64)
     precision[[1, -1]] = torch.inf
-    problem = hybrid_problem(board.points, shapes, pixels, torch.ones(1, board.corners), MODEL, mean, precision)
+    problem = views_of(board.points, modes, pixels).problem_under(MODEL, mean, precision)
     (prior,) = problem.terms
     # cx is held, and the last mode of the board.
     assert prior.index.tolist() == [0, 3, *range(5, 5 + SIZE), 5 + SIZE]  # type: ignore[attr-defined]

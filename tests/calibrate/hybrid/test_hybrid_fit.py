@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from hybrid_views import views_of
 from standing_views import quadratic, standing
 from torch import Tensor
 
@@ -22,7 +23,6 @@ from kcal.calibrate.hybrid.evidence import (
 )
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, rough_start
-from kcal.calibrate.hybrid.fitted_views import hybrid_problem
 from kcal.calibrate.problem.state import BoardState
 from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.model import HybridForm
@@ -319,10 +319,8 @@ def test_rows_are_derivatives_of_residuals() -> None:
     pixels = views(truth(), 4, 7)
     model = found.camera.model
     count = 3 + model.size + 28
-    problem = hybrid_problem(
-        BOARD.points, found.board_shapes.shapes, pixels, torch.ones(4, BOARD.corners, dtype=torch.float64), model,
-        torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64),
-    )  # fmt: skip
+    nothing = torch.zeros(count, dtype=torch.float64)
+    problem = views_of(BOARD.points, found.board_shapes, pixels).problem_under(model, nothing, nothing)
     state = BoardState.still(state.parameters, state.board, state.rotation[:4], state.translation[:4])
     rows = problem.rows(state)
     for index in (0, 1, 3, 4, 5, 8, 40, count - 28, count - 1):
@@ -341,10 +339,8 @@ def test_normal_equations_without_poses() -> None:
     pixels = views(truth(), 5, 8)
     model = found.camera.model
     count = 3 + model.size + 28
-    problem = hybrid_problem(
-        BOARD.points, found.board_shapes.shapes, pixels, torch.ones(5, BOARD.corners, dtype=torch.float64), model,
-        torch.zeros(count, dtype=torch.float64), torch.full((count,), 1e-3, dtype=torch.float64),
-    )  # fmt: skip
+    weak = torch.full((count,), 1e-3, dtype=torch.float64)
+    problem = views_of(BOARD.points, found.board_shapes, pixels).problem_under(model, 0.0 * weak, weak)
     start = found.state
     state = BoardState.still(start.parameters, start.board, start.rotation[:5], start.translation[:5])
     state = minimize(problem, state, LMOptions(max_iterations=5)).state
@@ -372,9 +368,7 @@ def test_a_start_may_have_corners_beyond_the_disc() -> None:
     model = LensModel(hybrid=HybridForm(shape=0.4, radius=0.2))
     count = 3 + model.size + 28
     held = torch.full((count,), torch.inf, dtype=torch.float64)
-    problem = hybrid_problem(
-        BOARD.points, found.board_shapes.shapes, pixels, torch.ones_like(pixels[..., 0]), model, 0 * held, held
-    )
+    problem = views_of(BOARD.points, found.board_shapes, pixels).problem_under(model, torch.zeros_like(held), held)
     params = torch.zeros(5 + model.size, dtype=torch.float64)
     params[:4] = found.camera.params.detach()[:4]
     state = BoardState.still(params, 0 * found.state.board, found.state.rotation[:4], found.state.translation[:4])

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from hybrid_views import views_of
 from torch import Tensor
 
 from kcal import Board, Camera
@@ -16,7 +17,7 @@ from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.evidence import Amplitudes, Quadratic, ViewData, maximize_evidence, view_data
 from kcal.calibrate.hybrid.families import prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
-from kcal.calibrate.hybrid.fitted_views import FittedViews, hybrid_problem, motion_is_worth, run_rounds
+from kcal.calibrate.hybrid.fitted_views import FittedViews, motion_is_worth, run_rounds
 from kcal.calibrate.problem import board_problem
 from kcal.calibrate.problem.board_problem import POSE, BoardProblem
 from kcal.calibrate.problem.state import (
@@ -105,15 +106,17 @@ def moving_problem(square: bool, bends: bool = False) -> tuple[BoardProblem, Boa
     generator = torch.Generator().manual_seed(2)
     pixels = capture(2e-3, 4)
     model = LensModel(hybrid=HybridForm(shape=0.6, radius=1.1, modes=MODES))
-    shapes = board_modes(BOARD.points).shapes
+    modes = board_modes(BOARD.points)
+    shapes = modes.shapes
     count = 3 + model.size + len(shapes) + (0 if square else 1)
     heights = board_modes(BOARD.points).heights if bends else None
     readout = Readout(center=BOARD.points.mean(0), distance=0.6, size=SIZE, bends=heights)
     still = stillness(RATIO[: 5 if bends else 4], torch.tensor([0.5, 1.0, 2.0, 0.7], dtype=F64) if bends else None)
-    problem = hybrid_problem(
-        BOARD.points, shapes, pixels, torch.ones(4, BOARD.corners, dtype=F64), model, torch.zeros(count, dtype=F64),
-        torch.zeros(count, dtype=F64), readout, still, square,
-    )  # fmt: skip
+    nothing, views = (
+        torch.zeros(count, dtype=F64),
+        views_of(BOARD.points, modes, pixels, readout=readout, square=square),
+    )
+    problem = views.problem_under(model, nothing, nothing, still)
     params = torch.zeros(5 + model.size, dtype=F64)
     params[:4] = torch.tensor([800.0, 800.0 if square else 830.0, 640.0, 480.0])
     params[8:] = 1e-3 * torch.randn(len(MODES), generator=generator, dtype=F64)
