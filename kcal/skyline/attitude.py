@@ -237,18 +237,19 @@ def attitude_against(
         f". The raster has no horizon in {100 * open_share:.0f} % of the directions around the camera: it ends before "
         "the terrain falls away, or has cells without a height"
     )  # fmt: skip
+    above = _above_ground(raster, place)
     if fit is None:
-        raise InputError(f"{_CONTRADICTED} no heading fits; {_cure(raster, place)}{gap}")
-    return _checked_attitude(fit, found, columns, horizon, border, camera, raster, place, gap)
+        raise InputError(f"{_CONTRADICTED} no heading fits; {_cure(above)}{gap}")
+    return _checked_attitude(fit, found, columns, horizon, border, camera, above, gap)
 
 
 _CONTRADICTED = "the raster contradicts the image:"
 
 
-def _cure(raster: Raster, place: Origin) -> str:
+def _cure(above: float) -> str:
     return (
-        f"check the camera's place and height ({_above_ground(raster, place):.0f} m above the raster's ground), the "
-        "raster's heights (--geoid) and accuracy, and that the image shows a skyline by day"
+        f"check the camera's place and height ({above:.0f} m above the raster's ground), the raster's heights "
+        "(--geoid) and accuracy, and that the image shows a skyline by day"
     )
 
 
@@ -270,29 +271,24 @@ def _azimuths(columns: Columns, found: fits.Candidate) -> Floats:
 
 def _checked_attitude(
     fit: fits.SkylineFit, found: list[fits.Candidate], columns: Columns, horizon: Horizon, border: Border,
-    camera: Camera, raster: Raster, place: Origin, gap: str,
+    camera: Camera, above: float, gap: str,
 ) -> SkylineAttitude:  # fmt: skip
-    """The attitude, unless something speaks against it."""
+    """The attitude, unless something speaks against it; `above`: meters of the camera above the raster's ground."""
     heading, pitch, roll = attitude(torch.from_numpy(fit.rotation.T.copy()))
     widened = math.sqrt(variance_factor(fit.chi2, fit.freedom))
     turn = _angles_by_turn(fit.rotation)
     sigma = widened * np.sqrt(np.diag(turn @ fit.covariance @ turn.T))
     agreeing = float(fit.used.mean())
-    if agreeing < _AGREEING:
-        raise InputError(
-            f"{_CONTRADICTED} {100 * agreeing:.0f} % of the skyline's clear columns agree in the best heading, "
-            f"{heading:.1f} degrees; {_cure(raster, place)}{gap}"
-        )
-    if fit.below > _BELOW:
-        raise InputError(
-            f"{_CONTRADICTED} in {100 * fit.below:.0f} % of the columns its skyline is below the raster's, which "
-            f"nothing that grows or was built explains; {_cure(raster, place)}{gap}"
-        )
-    if widened > _CONTRADICTS:
-        raise InputError(
-            f"{_CONTRADICTED} residuals are {widened:.1f} times as large as their sigmas say; "
-            f"{_cure(raster, place)}{gap}"
-        )
+    few = f"{100 * agreeing:.0f} % of the skyline's clear columns agree in the best heading, {heading:.1f} degrees"
+    below = (
+        f"in {100 * fit.below:.0f} % of the columns its skyline is below the raster's, which nothing that grows or was"
+    )
+    large = f"residuals are {widened:.1f} times as large as their sigmas say"
+    for wrong, text in (
+        (agreeing < _AGREEING, few), (fit.below > _BELOW, f"{below} built explains"), (widened > _CONTRADICTS, large)
+    ):  # fmt: skip
+        if wrong:
+            raise InputError(f"{_CONTRADICTED} {text}; {_cure(above)}{gap}")
     apart = [abs((one.heading - heading + 180.0) % 360.0 - 180.0) for one in found]
     others = [one for one, off in zip(found, apart, strict=True) if off > max(5.0 * sigma[0], _ONE)]
     worse = others[0].cost - found[0].cost if others else math.inf
@@ -333,7 +329,7 @@ def _checked_attitude(
         expected=expected,
         second_deg=others[0].heading if others else math.nan,
         second_worse=worse,
-        warnings=tuple(_attitude_warnings(fit, columns, horizon, raster, place, widened)),
+        warnings=tuple(_attitude_warnings(fit, columns, horizon, above, widened)),
         fit=fit,
     )
 
@@ -351,10 +347,9 @@ def _angles_by_turn(rotation: Floats) -> Floats:
 
 
 def _attitude_warnings(
-    fit: fits.SkylineFit, columns: Columns, horizon: Horizon, raster: Raster, place: Origin, widened: float
+    fit: fits.SkylineFit, columns: Columns, horizon: Horizon, above: float, widened: float
 ) -> list[str]:
     found = []
-    above = _above_ground(raster, place)
     if above > _HIGH:
         found.append(
             f"the camera stands {above:.0f} m above the raster's ground; if its heights are above the sea, add the "
