@@ -489,7 +489,7 @@ def _near_middle(found: DetectedStars, size: tuple[int, int], share: float) -> D
     return found._replace(pixels=found.pixels[use], sigma=found.sigma[use], flux=found.flux[use])
 
 
-class _Seen(NamedTuple):
+class _StarImage(NamedTuple):
     """The named stars of an image, their numbers (N,) in the catalogue, and the rotation from the stars' frame."""
 
     field: StarField
@@ -503,7 +503,7 @@ def _star_fields(
     camera: Camera,
     rotations: dict[int, np.ndarray],
     catalog: StarCatalog,
-) -> dict[int, _Seen]:
+) -> dict[int, _StarImage]:
     """Stars with names of each image whose attitude is roughly known, in its own frame, by its number."""
     seen = {}
     for number, rotation in sorted(rotations.items()):
@@ -515,7 +515,7 @@ def _star_fields(
             continue
         use = best.star >= 0
         parts = directions[best.star[use]], found.pixels[use], found.sigma[use]
-        seen[number] = _Seen(StarField(*map(torch.from_numpy, parts)), best.star[use], best.rotation)
+        seen[number] = _StarImage(StarField(*map(torch.from_numpy, parts)), best.star[use], best.rotation)
     return seen
 
 
