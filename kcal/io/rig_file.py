@@ -24,7 +24,7 @@ from kcal.io.camera_file import CameraFile, named_camera_file
 from kcal.io.file_summary import RigSummary
 from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
-from kcal.lens.pair_errors import by_relative
+from kcal.lens.pair_errors import relative_root
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting, Origin, Rig
 from kcal.native_file import NativeFile, Record, storing
@@ -252,8 +252,7 @@ def _from_two(content: dict[str, Any]) -> dict[str, Any]:
             # Of other cameras: the checks say so.
             more["root"] = half
         elif len(joint := _joint_errors(lenses + 6, half, owned if stands else None)):
-            root = joint @ by_relative(lenses, center, turn, look, back=True).T
-            more["root"] = Packed.of(root).model_dump()
+            more["root"] = Packed.of(relative_root(joint, center, turn, look, back=True)).model_dump()
     still = {"rotation": torch.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
     return {
         "version": RigFile.VERSION, "names": ["left", "right"], "cameras": cameras, "poses": [still, pose],

@@ -80,23 +80,22 @@ class RigCovariance:
         return self.half.T @ self.half
 
 
-@torch.no_grad()
-def by_relative(lenses: int, center: Tensor, right: Tensor, look: Tensor, *, back: bool) -> Tensor:
-    """(P, P) derivatives of the quantities of `Rig.relative_root` by those of `Rig.root`.
+def relative_root(root: Tensor, center: Tensor, right: Tensor, look: Tensor, *, back: bool = False) -> Tensor:
+    """(K, P) `Rig.root` in the quantities of `Rig.relative_root`.
 
     Args:
-        lenses: how many parameters both cameras have.
+        root: of two cameras.
         center: (2, 3) of the cameras, meters.
         right: (3, 3) rotation right_from_rig.
         look: (3, 3) rotation enu_from_rig.
         back: the inverse of it.
     """
-    between = center[0] - center[1]
-    crossed = torch.linalg.cross(between.expand(3, 3), torch.eye(3).to(center)).T
-    by = torch.eye(lenses + 13).to(center)
-    by[lenses : lenses + 12] = 0.0
+    center, right = center.detach().to(root), right.detach().to(root)
+    look, between = look.to(root), center[0] - center[1]
+    crossed = torch.linalg.cross(between.expand(3, 3), torch.eye(3).to(root)).T
+    by = torch.block_diag(torch.zeros(12, 12).to(root), torch.ones(1, 1).to(root))
     # Center and turn of both cameras; turn and shift of the relative pose, place and attitude.
-    c0, t0, c1, t1 = turn, shift, place, attitude = [slice(lenses + at, lenses + at + 3) for at in (0, 3, 6, 9)]
+    c0, t0, c1, t1 = turn, shift, place, attitude = [slice(at, at + 3) for at in (0, 3, 6, 9)]
     if back:
         by[c0, place], by[t0, attitude] = look.T, look.T
         by[t1, attitude], by[t1, turn] = look.T, -right.T
@@ -106,4 +105,8 @@ def by_relative(lenses: int, center: Tensor, right: Tensor, look: Tensor, *, bac
         by[turn, t0], by[turn, t1] = right, -right
         by[shift, c0], by[shift, c1], by[shift, t1] = right, -right, right @ crossed
         by[place, c0], by[attitude, t0] = look, look
-    return by
+    lenses, poses = root[:, :-13], root[:, -13:]
+    found = poses @ by.T
+    # A difference that is zero but for rounding is zero.
+    found = torch.where(found.abs() > 1e-13 * (poses.abs() @ by.T.abs()), found, 0.0)
+    return torch.cat([lenses, found], 1)

@@ -21,7 +21,7 @@ from kcal.gaussian import half_of_covariance
 from kcal.lens.calibration import RigCalibration, UntilChanged
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
-from kcal.lens.pair_errors import RigCovariance, by_relative
+from kcal.lens.pair_errors import RigCovariance, relative_root
 from kcal.lens.pose import Movable, check_motion, enu_from_cam, rotation_from_vector
 from kcal.texts import brief, length_text
 from kcal.values import number_list
@@ -494,22 +494,19 @@ class Rig(Movable, StatedModule):
         These are the lenses' and the relative pose in the order of `RigCovariance`, then place and attitude of the left
         camera and refraction in that of `Mounting.covariance`.
         """
-        if self.root is None or len(self) != 2:
-            return None
-        by = self._relative().to(self.root)
-        found = self.root @ by.T
-        # A difference that is zero but for rounding is zero.
-        return torch.where(found.abs() > 1e-13 * (self.root.abs() @ by.T.abs()), found, 0.0)
+        root = self.root
+        return None if root is None or len(self) != 2 else self._changed(root)
 
     @relative_root.setter
     def relative_root(self, value: Tensor) -> None:
         _of_two(self, "relative_root")
         require_root("joint covariance", value, self.quantities)
-        self.root = value @ self._relative(back=True).to(value).T
+        self.root = self._changed(value, back=True)
 
-    def _relative(self, *, back: bool = False) -> Tensor:
-        look = torch.eye(3).to(self.center) if self._stands is None else self._stands.enu_from_cam.to(self.center)
-        return by_relative(sum(self.sizes), self.center, self.rotation[1], look, back=back)
+    def _changed(self, root: Tensor, *, back: bool = False) -> Tensor:
+        stands = self._stands
+        look = torch.eye(3) if stands is None else stands.enu_from_cam
+        return relative_root(root, self.center, self.rotation[1], look, back=back)
 
     def _take(self, covariance: Tensor | None, stands: Mounting | None, mounting: Tensor | None) -> None:
         """Set `root` to independent errors (K, P - 7) of lenses and relative pose, and (L, 7) of the mounting."""

@@ -125,7 +125,8 @@ def near_epipolar_lines(
     """
     rotation, shift = rig.right_from_left_rotation, rig.right_from_left_translation
     sizes = (rig.left.values.shape[-1], rig.right.values.shape[-1], 3, 3)
-    known = shift.new_zeros(0, sum(sizes)) if rig.covariance is None else rig.covariance.half.to(shift)
+    errors = rig.covariance
+    known = shift.new_zeros(0, sum(sizes)) if errors is None else errors.half.to(shift)
     own = known.T.split(sizes)
     near = torch.zeros(*left.shape[:-1], right.shape[-2], dtype=torch.bool, device=left.device)
     if not near.numel():
