@@ -89,8 +89,8 @@ def compare(views: int, repeats: int, timeout: float) -> list[Any]:
             cells.append(found[-1]["failed"])
             continue
         seconds = [run["seconds"] for run in found]
-        ratios = [b / a for a, b in zip(first, seconds, strict=True)]
-        spread = "" if found is runs[DEFAULT] else f" ({statistics.median(ratios):.2f} times)"
+        ratios = [a / b for a, b in zip(first, seconds, strict=True)]
+        spread = "" if found is runs[DEFAULT] else f" ({statistics.median(ratios):.2f})"
         cells.append(f"{statistics.median(seconds):.2f} s{spread}")
     return [*cells, f"{runs[DEFAULT][-1]['megabytes']:.0f} MB"]
 

@@ -119,7 +119,7 @@ def inverse_nets(rounds: int = 15, seeds: int = 3) -> Iterator[str]:
         found = times([lambda: camera.unproject(pixels), lambda: camera.unproject(pixels, start=guess)], rounds)  # noqa: B023
         saved = (evaluations(camera, pixels, start) for start in (None, guess))
         rows.append([name, *saved, ratio(found[1], found[0])])
-    return table(["camera", "evaluations of the lens a call", "with the net", "time without / with"], rows)
+    return table(["camera", "evaluations of the lens a call", "with the net", "time with / without"], rows)
 
 
 @section("lens.md", "lookup tables", rounds=1)
@@ -155,4 +155,4 @@ def lookup_tables(rounds: int = 15) -> Iterator[str]:
                 ratio(found[1], found[0]), ratio(found[3], found[2]),
             ])  # fmt: skip
     heads = ["camera", "tolerance, px", "baking, s", "file, kB", "bound, px", "largest error found, px", "answers for"]
-    return table([*heads, "project: camera / table", "unproject: camera / table"], rows)
+    return table([*heads, "project: table / camera", "unproject: table / camera"], rows)

@@ -43,13 +43,8 @@ def median(values: Sequence[float], digits: int = 1) -> str:
 
 
 def ratio(own: Sequence[float], other: Sequence[float], digits: int = 2) -> str:
-    """Median of the other's time over one's own, round by round: above 1, one's own is faster."""
-    return median([b / a for a, b in zip(own, other, strict=True)], digits)
-
-
-def ratios(own: Sequence[float], other: Sequence[float], digits: int = 2) -> str:
-    """`spread` of the other's time over one's own, round by round: above 1, one's own is faster."""
-    return spread([b / a for a, b in zip(own, other, strict=True)], digits)
+    """Median of one's own time over the other's, round by round: below 1, one's own is faster."""
+    return median([a / b for a, b in zip(own, other, strict=True)], digits)
 
 
 def row(*cells: object) -> str:
