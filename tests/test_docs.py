@@ -194,10 +194,11 @@ MEASURED = sorted((ROOT / "docs" / "measured").glob("*.md"))
 
 @pytest.mark.parametrize("page", MEASURED, ids=[page.stem for page in MEASURED])
 def test_a_measured_page_concludes_and_then_shows(page: Path) -> None:
-    """The conclusion, a table or a picture with a caption at most, and before the next title what makes it."""
+    """Where kcal is behind, the conclusion, a table or a picture with a caption, and what makes it."""
     text = re.sub(r"<!--.*?-->\n", "", page.read_text(encoding="utf-8"))
     beginning = re.split(r"\n## ", text)[0]
-    _, conclusion, *shown = beginning.split("\n\n")
+    _, losses, conclusion, *shown = beginning.split("\n\n")
+    assert losses.startswith("**Losses.** ")
     assert conclusion.startswith("**Conclusion.** ")
     assert any(block.startswith(("| ", "![")) for block in shown[:2])
     assert re.search(r"`(python -m scripts\.|scripts/)", "".join(shown))

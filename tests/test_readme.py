@@ -58,6 +58,13 @@ def test_commands_and_options_exist(words: list[str]) -> None:
             assert re.search(rf"(?<![\w-]){re.escape(word)}(?![\w-])", help_text), word
 
 
+def test_the_error_of_its_picture_is_one_figure() -> None:
+    (shown,) = re.findall(r"median errors at 5 km of \d+ m, and of (\d+ m)\]", README)
+    guide = (ROOT / "docs" / "tutorial" / "guide.md").read_text(encoding="utf-8")
+    assert f"The README's ± {shown} is calibration alone" in " ".join(guide.split())
+    assert "median error of the range by calibration alone" in README
+
+
 def test_make_targets_exist() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     targets = re.findall(r"`make (\w+)`", README)
