@@ -30,7 +30,7 @@ from kcal.corners.images import expand_images, read_gray
 from kcal.corners.refine import refine_corners
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.scene import render_board
-from scripts.bench.found import classic, sector
+from scripts.bench.found import by_classic, by_sector
 from scripts.shared.page import table
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import section
@@ -70,14 +70,13 @@ def single(images: list[Image]) -> Iterator[list[str]]:
         side = local_side(start, BOARD.columns, BOARD.rows)
         return refine_corners(image, start, side, "erf", (BOARD.columns, BOARD.rows))
 
-    search = sector()
     methods: dict[str, Callable[[Image], object | None]] = {
         "kcal, detection alone": lambda image: detect_board(image, BOARD, "none").pixels,
         "kcal, erf refinement alone": refine,
         "kcal, both": lambda image: detect_board(image, BOARD).pixels,
-        "findChessboardCorners": lambda image: classic(image, BOARD, refine=False),
-        "findChessboardCorners and cornerSubPix 5": lambda image: classic(image, BOARD),
-        "findChessboardCornersSB, exhaustive and accurate": lambda image: search(image, BOARD),
+        "findChessboardCorners": lambda image: by_classic(image, BOARD, refine=False),
+        "findChessboardCorners and cornerSubPix 5": lambda image: by_classic(image, BOARD),
+        "findChessboardCornersSB, exhaustive and accurate": lambda image: by_sector(image, BOARD),
     }
     for name, work in methods.items():
         some = images[:SLOW] if name.startswith(SLOWEST) and images[0].size > 1e6 else images

@@ -40,13 +40,25 @@ _SECTOR = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALI
 Detector = Callable[[NDArray[Any], Board], Tensor | None]
 
 
-def classic(image: NDArray[Any], board: Board, refine: bool = True) -> Tensor | None:
+def classic(image: NDArray[Any], board: Board) -> Tensor | None:
     """`findChessboardCorners` and `cornerSubPix`."""
     gray = to_8bit(image)
+    corners = by_classic(gray, board)
+    return None if corners is None else as_points(gray, corners, board)
+
+
+def by_classic(gray: NDArray[np.uint8], board: Board, refine: bool = True) -> NDArray[Any] | None:
+    """OpenCV's own answer."""
     found, corners = cv2.findChessboardCorners(gray, (board.columns, board.rows), flags=_CLASSIC)
-    if found and refine:
-        corners = cv2.cornerSubPix(gray, corners, (5, 5), (-1, -1), (3, 100, 1e-4))
-    return as_points(gray, corners, board) if found else None
+    if not found:
+        return None
+    return cv2.cornerSubPix(gray, corners, (5, 5), (-1, -1), (3, 100, 1e-4)) if refine else corners
+
+
+def by_sector(gray: NDArray[np.uint8], board: Board) -> NDArray[Any] | None:
+    """OpenCV's own answer."""
+    found, corners = cv2.findChessboardCornersSB(gray, (board.columns, board.rows), flags=_SECTOR)
+    return corners if found else None
 
 
 def as_points(gray: NDArray[np.uint8], corners: NDArray[Any], board: Board) -> Tensor:
@@ -54,21 +66,17 @@ def as_points(gray: NDArray[np.uint8], corners: NDArray[Any], board: Board) -> T
     return canonical_order(gray, torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)), board)
 
 
-def sector(flags: int = _SECTOR) -> Detector:
+def sector(image: NDArray[Any], board: Board) -> Tensor | None:
     """`findChessboardCornersSB`."""
-
-    def find(image: NDArray[Any], board: Board) -> Tensor | None:
-        gray = to_8bit(image)
-        found, corners = cv2.findChessboardCornersSB(gray, (board.columns, board.rows), flags=flags)
-        return as_points(gray, corners, board) if found else None
-
-    return find
+    gray = to_8bit(image)
+    corners = by_sector(gray, board)
+    return None if corners is None else as_points(gray, corners, board)
 
 
 DETECTORS: dict[str, Detector] = {
     "kcal": lambda image, board: detect_board(image, board).pixels,
     "classic, cornerSubPix 5": classic,
-    "SB, exhaustive, accurate, normalized": sector(),
+    "SB, exhaustive, accurate, normalized": sector,
 }
 
 

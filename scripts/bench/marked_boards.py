@@ -102,10 +102,11 @@ def marked_boards(images: int = 10, kinds: int = len(KINDS)) -> Iterator[str]:
         yield "AprilTag's own library is left out: `pip install --target DIR pupil-apriltags`, DIR in PYTHONPATH."
     for name, detectors in BOARDS:
         board = Board.parse(name, "30mm")
-        scene = Marked(board)
-        rows = (
-            [kind.__name__, *(score(find, pictures(kind, images, scene), board) for find in detectors.values())]
-            for kind in KINDS[:kinds]
-        )
         yield from ["", f"`{name}`:", ""]
-        yield from table(["", *detectors], rows)
+        yield from table(["", *detectors], _rows(board, detectors, images, kinds))
+
+
+def _rows(board: Board, detectors: dict[str, Detector], images: int, kinds: int) -> Iterator[list[str]]:
+    for kind in KINDS[:kinds]:
+        some = list(pictures(kind, images, Marked(board)))
+        yield [kind.__name__, *(score(find, some, board) for find in detectors.values())]

@@ -234,8 +234,12 @@ def measured(step: Step, size: int) -> list[str]:
     return [step.title, f"{size:,}", f"{float(seconds):.1f}", f"{float(peak):,.0f}", said]
 
 
+# Megapixels and views of a quick run.
+IN_LITTLE = {"image": 1, "detect": 1, "views": 8}
+
+
 def _registered(name: str) -> None:
-    @section("precision.md", "fleet memory" if name == "fleet" else name, sizes=(1,) if name == "image" else (100,))
+    @section("precision.md", "fleet memory" if name == "fleet" else name, sizes=(IN_LITTLE.get(name, 100),))
     def measure(largest: bool = False, sizes: tuple[int, ...] = (0,)) -> Iterator[str]:
         rows = (
             measured(step, size)

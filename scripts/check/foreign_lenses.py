@@ -326,4 +326,4 @@ def rows(folder: Path) -> Iterator[list[str]]:
 @section("other-programs.md", "foreign lenses")
 def foreign_lenses() -> Iterator[str]:
     with tempfile.TemporaryDirectory() as name:
-        return table(["program", "direction", "lens", "largest error, px", "reader"], rows(Path(name)))
+        return table(["program", "direction", "lens", "largest error, px", "reader"], [*rows(Path(name))])

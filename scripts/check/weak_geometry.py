@@ -151,7 +151,7 @@ def judged(truth: Rig, found: RigResult, draw: Draw, widen: float = 1.0) -> tupl
 def unchecked(truth: Rig, seen: Landmarks) -> RigResult:
     """What `solve_rig` would find without the check."""
     data = RigData(cameras=(truth.left, truth.right), names=("left", "right"), landmarks=seen)
-    with mock.patch.object(solve, "check_places", return_value=(1.0, [])):
+    with mock.patch.object(assess, "check_places", return_value=(1.0, [])):
         return solve.solve_rig(data, solve.RigOptions(intrinsics="fixed", refraction=0.0, refraction_sigma=0.0))
 
 

@@ -65,11 +65,12 @@ def simulate(
 
 
 def observed(pixels: list[list[list[float]]]) -> Observations:
-    """Corners (V, N, 2) of the benchmark's board as observations."""
+    """Corners (V, N, 2) of the benchmark's board as observations; NaN where not seen."""
     from kcal.corners.board import Board
     from kcal.corners.observations import Observations, View
 
-    views = tuple(View(name=f"{i:04}", pixels=tuple((u, v) for u, v in view)) for i, view in enumerate(pixels))
+    corners = (tuple((u, v) if u == u else None for u, v in view) for view in pixels)
+    views = tuple(View(name=f"{i:04}", pixels=view) for i, view in enumerate(corners))
     return Observations(board=Board(columns=COLUMNS, rows=ROWS, square=SQUARE), image_size=SIZE, views=views)
 
 
