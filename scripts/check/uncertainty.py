@@ -52,8 +52,9 @@ class Fit(NamedTuple):
 
 def refit(pixels: Tensor, options: CalibrationOptions, truth: Camera, rays: Tensor) -> Fit:
     """Calibrate one capture; `rays` (P + G, 3) are those of the places, then of a grid over the image."""
-    seen = truth.inside(pixels)  # some corners of the benchmark's poses are outside through this lens
-    result = calibrate_camera(observed(torch.where(seen[..., None], pixels, torch.nan).tolist()), options)
+    # Some corners of the benchmark's poses are outside the image of this lens.
+    pixels = torch.where(truth.inside(pixels)[..., None], pixels, torch.nan)
+    result = calibrate_camera(observed(pixels.tolist()), options)
     wanted, _ = truth.project(rays)
     names, model = list(range(len(result.camera.names))), result.camera.model
     seen = project_components(rays.T, result.camera.params, model, names)
