@@ -13,7 +13,7 @@ from kcal.calibrate.camera.advice import roll_findings
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.fit import HybridFit, pixels_are_square
 from kcal.calibrate.problem.parameters import GaussianPrior, Term
-from kcal.calibrate.problem.state import FELT, LARGEST, BoardState
+from kcal.calibrate.problem.state import FELT, FEW, LARGEST, BoardState
 from kcal.errors import InputError
 from kcal.finding import Finding
 from kcal.lens.camera import Camera
@@ -24,8 +24,6 @@ from kcal.texts import percent_text
 
 # Warnings about how views were taken: motion while rows were read, and images that were stretched.
 
-# Of fewer views that moved, 95 % ellipses contain the truth in 86 to 93 % (`scripts/check/captures_that_move.py`).
-_FEW = 6
 # Views in which the board bends by so many times what is typical are named, if they are no more than this share.
 _BENT, _SOME, _NAMED = 2.0, 0.5, 5
 # A share of the largest motion, from which it is at its limit.
@@ -46,16 +44,20 @@ def motion_findings(fit: HybridFit) -> list[Finding]:
     moved = fit.motion_sigma.moved(float(fit.state.parameters[0]), fit.readout.reach(fit.board_points))
     if moved < FELT * fit.sigma:
         return []
-    views, found = len(fit.state.motion), []
-    if views < _FEW:
-        text = f"{views} views that moved are few: error bars are wide, and may still be too small"
-        found.append(Finding("motion", "doubt", text, f"use a stand, or {_FEW} views or more"))
-    text = (
-        f"the camera or the board moved while {lines}s were read (rolling shutter), by some {moved:.1f} px from the "
-        f"first {lines} to the last: this is taken out, and error bars allow for it"
-    )
-    action = "put both on a stand, or take the still moments of a video, for smaller error bars"
-    return [*found, Finding("motion", "doubt", text, action)]
+    views = len(fit.state.motion)
+    if views < FEW:
+        text = (
+            f"{views} views hardly tell whether the camera or the board moved while {lines}s were read (rolling "
+            f"shutter): error bars allow for what a hand does, some {moved:.1f} px from the first {lines} to the last"
+        )
+        action = f"take {FEW} views or more; or, if both stood still, leave motion out (--without motion)"
+    else:
+        text = (
+            f"the camera or the board moved while {lines}s were read (rolling shutter), by some {moved:.1f} px from "
+            f"the first {lines} to the last: this is taken out, and error bars allow for it"
+        )
+        action = "put both on a stand, or take the still moments of a video, for smaller error bars"
+    return [Finding("motion", "doubt", text, action)]
 
 
 def bending_findings(names: Sequence[str], fit: HybridFit) -> list[Finding]:

@@ -16,12 +16,11 @@ from kcal.calibrate.problem.state import (
     AXES,
     BENDS,
     LARGEST,
-    MEDIAN,
     SMALLEST,
-    SPREAD,
     amplitudes_of,
     by_number,
     stillness,
+    usual_motion,
 )
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.solve.schur import Products, matrix_product, products_of
@@ -477,7 +476,7 @@ class EvidenceLoss:
 
     def __init__(self, data: ViewData, families: PriorFamilies, prior: Hyperprior, tempering: float) -> None:
         self._data, self._families, self._tempering = data, families, tempering
-        self._mean, self._sd = prior.mean.numpy(), prior.sd.numpy()
+        self._mean, self._sd, self._by_hand = prior.mean.numpy(), prior.sd.numpy(), prior.by_hand
 
     def values(self, many: np.ndarray) -> np.ndarray:
         """(N,) values of many v (N, H + 5) without derivatives, far cheaper; infinite where numbers overflow."""
@@ -510,9 +509,9 @@ class EvidenceLoss:
             slope[own], bend[own, own] = slopes.first, slopes.second
             bend[own, others] = np.concatenate([slopes.by_variance @ found.by_h, slopes.by_noise[:, None]], 1)
             bend[others, own] = bend[own, others].T
-        z, w = self._scaled(v)
+        (z, w), (_, spread) = self._scaled(v), usual_motion(motions, self._by_hand)
         each = np.zeros((motions, len(v)))
-        each[:, count:-1], each[:, -1] = np.eye(motions) / SPREAD, 0.5 / SPREAD
+        each[:, count:-1], each[:, -1] = np.diag(1.0 / spread), 0.5 / spread
         slope[:count] += z / self._sd
         bend[np.diag_indices(count)] += self._sd**-2.0
         value = found.value + self._beside(v, integrated.log_determinant)
@@ -526,7 +525,8 @@ class EvidenceLoss:
         """Distances from the means of the hyperprior, in its standard deviations."""
         h, ratio, log_variance = self._parts(v)
         # The prior of the motions' amplitudes is about these, not about their ratios to the noise.
-        return (h - self._mean) / self._sd, (ratio + 0.5 * log_variance - math.log(MEDIAN)) / SPREAD
+        usual, spread = usual_motion(len(ratio), self._by_hand)
+        return (h - self._mean) / self._sd, (ratio + 0.5 * log_variance - usual) / spread
 
     def _beside(self, v: np.ndarray, log_determinant: float) -> float:
         z, w = self._scaled(v)

@@ -43,11 +43,13 @@ class Hyperprior(NamedTuple):
         mean: (H,).
         sd: (H,) standard deviations.
         most: (H,) largest values; None: there is no limit.
+        by_hand: whether views move as by hand, because they are too few to tell (`kcal.calibrate.problem.state.FEW`).
     """
 
     mean: Tensor
     sd: Tensor
     most: Tensor | None = None
+    by_hand: bool = False
 
 
 class PriorFamilies(NamedTuple):

@@ -37,7 +37,7 @@ from kcal.calibrate.hybrid.fitted_views import (
 from kcal.calibrate.hybrid.measured_board import BoardPrior, MeasuredBoard, off_by
 from kcal.calibrate.hybrid.network_fit import FieldTraining, train_network
 from kcal.calibrate.problem.board_problem import BoardProblem
-from kcal.calibrate.problem.state import BENDS, BoardState, MotionSigma, Readout, motion_sigma, stillness, widening
+from kcal.calibrate.problem.state import BENDS, FEW, BoardState, MotionSigma, Readout, motion_sigma, stillness, widening
 from kcal.calibrate.problem.views import among, information_of
 from kcal.errors import InputError
 from kcal.gaussian import triangular
@@ -224,7 +224,7 @@ def settle(
     elif lens is not None:
         modes = lens.form.modes
     modes = modes or ZernikeModes()
-    hyperprior, exact = typical_hyperprior(modes), options.board == "exact"
+    hyperprior, exact = typical_hyperprior(modes)._replace(by_hand=len(pixels) < FEW), options.board == "exact"
     ordered, shown = points, board_modes(points)
     if known is not None:
         points, shown = known.applied(points, shown)
@@ -574,7 +574,7 @@ def fit_hybrid(
     errors = problem.pixel_errors(state)
     if not robust:
         check_shown(errors)
-    wider = widening(len(pixels)) if capture.readout is not None else 1.0
+    wider = 1.0 if capture.readout is None or capture.hyperprior.by_hand else widening(len(pixels))
     half = math.sqrt(wider) * inverse * deviation
     information = information_of(problem, state, math.sqrt(wider * variance), reduced)
     if known is not None:

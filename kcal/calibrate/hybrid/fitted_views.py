@@ -39,6 +39,7 @@ from kcal.calibrate.problem.state import (
     Readout,
     motion_sigma,
     stillness,
+    usual_motion,
 )
 from kcal.calibrate.problem.views import LEAST_NOISE
 from kcal.gaussian import Gaussian, numbered
@@ -357,8 +358,10 @@ def begin_motion(capture: FittedViews, estimate: Estimate) -> Estimate:
     count, again = len(capture.pixels), len(old) == len(capture.pixels)
     if has == had and again:
         return estimate
-    begin = math.log(_MOVING) - 0.5 * math.log(estimate.amplitudes.variance)
-    motion, ratio = old.new_zeros(count, MOTION * has[0] + BENDS * has[1]), np.full(AMPLITUDES * has[0] + has[1], begin)
+    begin, by_hand = np.full(AMPLITUDES * has[0] + has[1], math.log(_MOVING)), capture.hyperprior.by_hand
+    begin = usual_motion(len(begin), True)[0] if by_hand and has[0] else begin
+    ratio = begin - 0.5 * math.log(estimate.amplitudes.variance)
+    motion = old.new_zeros(count, MOTION * has[0] + BENDS * has[1])
     # Motion comes first, bending last.
     numbers, parts = (slice(MOTION), slice(-BENDS, None)), (slice(AMPLITUDES), slice(-1, None))
     for kept in (k for k in (0, 1) if again and has[k] and had[k]):
@@ -368,12 +371,16 @@ def begin_motion(capture: FittedViews, estimate: Estimate) -> Estimate:
     return estimate._replace(state=estimate.state._replace(motion=motion), amplitudes=amplitudes, relative=relative)
 
 
-def _least_gained(readout: Readout, data: ViewData, estimate: Estimate) -> tuple[float, bool]:
-    """The smaller gain of evidence (nats), of motion beside bending or of bending beside motion; whether of motion."""
+def _least_gained(readout: Readout, data: ViewData, estimate: Estimate, by_hand: bool) -> tuple[float, bool]:
+    """The smaller gain of evidence (nats), of motion beside bending or of bending beside motion; whether of motion.
+
+    Where views move as by hand, nobody asks whether they moved.
+    """
     _, families, _, best, tempering, _ = estimate
-    parts = [(list(range(AMPLITUDES)), True)] * readout.moves
+    parts = [(list(range(AMPLITUDES)), True)] * (readout.moves and not by_hand)
     parts += [([len(best.log_ratio) - 1], False)] * (readout.bends is not None)
-    return min((evidence_of_motion(data, best, families, tempering, part), moves) for part, moves in parts)
+    gains = [(evidence_of_motion(data, best, families, tempering, part), moves) for part, moves in parts]
+    return min(gains, default=(math.inf, True))
 
 
 def _with_bending(capture: FittedViews, estimate: Estimate) -> tuple[FittedViews, Estimate] | None:
@@ -503,7 +510,7 @@ def run_rounds(
         if data.moving and turn < _ROUNDS - 1:
             # The first round tells it as the second does, within .05 nats for 16 simulated captures of 6 to 200 views.
             assert capture.readout is not None
-            gained, moves = _least_gained(capture.readout, data, estimate)
+            gained, moves = _least_gained(capture.readout, data, estimate, capture.hyperprior.by_hand)
             if gained < WORTH:
                 less = dataclasses.replace(capture.readout, **({"moves": False} if moves else {"bends": None}))
                 # A stiff board is not tried again.

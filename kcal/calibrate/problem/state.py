@@ -39,6 +39,10 @@ BENDS = 12
 # while an image is read. A hand that turns by 1 rad/s moves by 0.03 in 30 ms: beyond it is no motion. Below the
 # smallest no pixel feels it.
 MEDIAN, SPREAD, SMALLEST, LARGEST = 2e-4, 2.0, 1e-6, 0.03
+# Fewer views do not tell whether they moved: to first order about a camera of still views, true motions by hand gain as
+# little as those of a stand. They keep a hand's motion instead: turns by 0.3 rad/s, shifts by 0.1 m/s at half a meter,
+# for 20 ms; of second order what a tremor of some Hz adds. And the standard deviation of its logarithms.
+FEW, HAND, HAND_SPREAD = 6, (6e-3, 2.5e-3, 1.5e-3, 6e-4), 0.5
 # Readouts between the exposures of two cameras that are not synchronized, typically.
 APART = 10.0
 # A motion is worth a stand if it moves corners by so many standard deviations of their noise.
@@ -172,6 +176,14 @@ def by_number(log_ratio: np.ndarray, relative: Tensor | None = None) -> Tensor:
     ratio = ratio.repeat(len(relative), 1)
     ratio[:, -BENDS:] *= relative[:, None]
     return ratio
+
+
+def usual_motion(count: int, by_hand: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation (A,) of the prior of the logarithms of so many amplitudes of motion and bending."""
+    mean, sd = np.full(count, math.log(MEDIAN)), np.full(count, SPREAD)
+    if by_hand and count >= AMPLITUDES:
+        mean[:AMPLITUDES], sd[:AMPLITUDES] = np.log(HAND), HAND_SPREAD
+    return mean, sd
 
 
 def stillness(log_ratio: np.ndarray, relative: Tensor | None = None) -> Tensor:

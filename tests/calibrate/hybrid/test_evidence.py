@@ -25,7 +25,7 @@ from kcal.calibrate.hybrid.evidence import (
 )
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns
-from kcal.calibrate.problem.state import AMPLITUDES, MEDIAN, MOTION, SPREAD
+from kcal.calibrate.problem.state import AMPLITUDES, HAND, HAND_SPREAD, MEDIAN, MOTION, SPREAD, usual_motion
 from kcal.corners.board import Board
 from kcal.lens.model import HybridForm, LensModel
 from kcal.lens.zernike import ZernikeModes
@@ -110,6 +110,18 @@ def check_derivatives(loss: EvidenceLoss, at: np.ndarray) -> None:
 @pytest.mark.parametrize("moving", [False, True])
 def test_derivatives(moving: bool, tempering: float) -> None:
     check_derivatives(EvidenceLoss(data(moving), FAMILIES, PRIOR, tempering), vector(moving))
+
+
+def test_views_too_few_to_tell_whether_they_moved() -> None:
+    """Their motions' amplitudes are about those of a hand; the board's bending stays as it is."""
+    hand = EvidenceLoss(data(True), FAMILIES, PRIOR._replace(by_hand=True), 1.0)
+    log_sigma = AT[2:6] + 0.5 * AT[-1]
+    other, typical = (log_sigma - np.log(HAND)) / HAND_SPREAD, (log_sigma - math.log(MEDIAN)) / SPREAD
+    change = hand(AT)[0] - EvidenceLoss(data(True), FAMILIES, PRIOR, 1.0)(AT)[0]
+    assert change == pytest.approx(0.5 * float(other @ other - typical @ typical))
+    check_derivatives(hand, AT)
+    mean, sd = usual_motion(5, True)
+    assert (mean[4], sd[4]) == (math.log(MEDIAN), SPREAD)
 
 
 @pytest.mark.parametrize("amplitudes", [[4], [0, 1, 2, 3, 4]])

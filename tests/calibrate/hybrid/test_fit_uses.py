@@ -13,6 +13,7 @@ import torch
 from printed_boards import shown
 from torch import Tensor
 
+from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.hybrid import fit as room
 from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.hybrid.board_modes import board_modes, turned
@@ -29,13 +30,14 @@ from kcal.calibrate.hybrid.families import LensPrior, prior_families, typical_hy
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, rough_start
 from kcal.calibrate.hybrid.fitted_views import _cauchy_weights, moving_residuals
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, evidence, printed_board
-from kcal.calibrate.problem.state import Readout
+from kcal.calibrate.problem.state import HAND, Readout
 from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.camera import Camera
 from kcal.lens.information import BOARD_SLOT
 from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
+from scripts.shared.simulated import against_truth, simulated
 
 BOARD = Board(columns=8, rows=6, square=0.03)
 SIZE = (1280, 960)
@@ -308,6 +310,25 @@ def test_motion_is_looked_for_again_where_the_aspect_may_have_hidden_it(monkeypa
         monkeypatch.setattr(room, "aspect_score", of_pixels)
         fit_hybrid(BOARD.points, shots(8), SIZE, options=FitOptions(modes=MODES))
     assert asked == [3.5]
+
+
+@pytest.mark.parametrize(("views", "kept"), [(5, True), (6, False)])
+def test_few_views_do_not_tell_that_they_stood_still(views: int, kept: bool) -> None:
+    """They keep the motion of a hand, which six views that stood still lose; error bars are those of the posterior."""
+    options = FitOptions(modes=MODES, board="exact", square=True)
+    fit = fit_hybrid(BOARD.points, shots(views), SIZE, options=options)
+    assert (fit.motion_sigma is not None, fit.wider) == (kept, 1.0)
+    if fit.motion_sigma is not None:
+        assert 0.5 < fit.motion_sigma.turn / HAND[0] < 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 6, 27])
+def test_three_views_by_hand(seed: int) -> None:
+    """Lens and board explain most of their motion, and a fit that begins without it ends far off, its bars too small."""
+    found = against_truth(simulated(seed, 3, 0.08, by_hand=True), CalibrationOptions())
+    assert found["everywhere"] > 0.95
+    assert found["rms"] < 12.0
 
 
 def test_motions_of_views_that_were_held_out() -> None:

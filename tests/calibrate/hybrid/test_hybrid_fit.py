@@ -225,7 +225,7 @@ def test_evidence_is_that_of_the_linear_model() -> None:
         A = K * d[:, None] * d / variance + torch.eye(len(d), dtype=torch.float64)
         b = d * g / variance
         fit = c / variance - float(b @ torch.linalg.solve(A, b))
-        mean, sd, _ = typical_hyperprior()
+        mean, sd, *_ = typical_hyperprior()
         z = ((h - mean) / sd).numpy()
         return 0.5 * (400.0 * math.log(variance) + fit + float(torch.logdet(A))) + 0.5 * float(z @ z)
 
