@@ -30,7 +30,7 @@ from kcal.calibrate.hybrid.families import LensPrior, prior_families, typical_hy
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, rough_start
 from kcal.calibrate.hybrid.fitted_views import _cauchy_weights, moving_residuals
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, evidence, printed_board
-from kcal.calibrate.problem.state import HAND, Readout
+from kcal.calibrate.problem.state import HAND, HAND_SPREAD, Readout
 from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.camera import Camera
@@ -319,7 +319,7 @@ def test_few_views_do_not_tell_that_they_stood_still(views: int, kept: bool) -> 
     fit = fit_hybrid(BOARD.points, shots(views), SIZE, options=options)
     assert (fit.motion_sigma is not None, fit.wider) == (kept, 1.0)
     if fit.motion_sigma is not None:
-        assert 0.5 < fit.motion_sigma.turn / HAND[0] < 2.0
+        assert abs(math.log(fit.motion_sigma.turn / HAND[0])) < 3.0 * HAND_SPREAD
 
 
 @pytest.mark.slow
