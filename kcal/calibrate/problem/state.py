@@ -39,9 +39,10 @@ BENDS = 12
 # while an image is read. A hand that turns by 1 rad/s moves by 0.03 in 30 ms: beyond it is no motion. Below the
 # smallest no pixel feels it.
 MEDIAN, SPREAD, SMALLEST, LARGEST = 2e-4, 2.0, 1e-6, 0.03
-# Fewer views do not tell whether they moved: to first order about a camera of still views, true motions by hand gain as
-# little as those of a stand. They keep a hand's motion instead: turns by 0.3 rad/s, shifts by 0.1 m/s at half a meter,
-# for 20 ms; of second order what a tremor of some Hz adds. And the standard deviation of its logarithms.
+# Fewer views do not tell whether they moved: lens and board explain a hand's motion nearly as well, and a fit that
+# begins with less of it ends far off (docs/measured/ordinary.md). They keep a hand's motion: turns by 0.3 rad/s,
+# shifts by 0.1 m/s at 0.8 m, for 20 ms; of second order what a tremor of some Hz adds. And the standard deviation of
+# the logarithms of these.
 FEW, HAND, HAND_SPREAD = 6, (6e-3, 2.5e-3, 1.5e-3, 6e-4), 0.5
 # Readouts between the exposures of two cameras that are not synchronized, typically.
 APART = 10.0
@@ -49,18 +50,18 @@ APART = 10.0
 FELT = 5.0
 
 
-# Error bars of few views that moved are too small by themselves: amplitudes of motions are known only roughly, and what
-# follows from them is not linear. Views at which variances are doubled, and the power with which this fades: errors of
-# 900 simulated captures of 3 to 8 views by hand were 2.1 to 1.1 times what was stated (docs/measured/ordinary.md).
+# Error bars of six views or some more that moved are too small by themselves: amplitudes of motions are known only
+# roughly, and what follows from them is not linear. Views at which variances would be doubled, and the power with which
+# this fades: set on 900 simulated captures of 3 to 8 views by hand (docs/measured/ordinary.md).
 _DOUBLED, _FADES = 5.2, 3.0
 
 
 def widening(views: int) -> float:
-    """How many times larger variances are than the posterior's, where so many views moved.
+    """How many times larger variances are than the posterior's, where so many views moved, `FEW` or more.
 
     Example:
-        >>> round(widening(3), 1), round(widening(8), 2), round(widening(60), 3)
-        (6.2, 1.27, 1.001)
+        >>> round(widening(6), 2), round(widening(8), 2), round(widening(60), 3)
+        (1.65, 1.27, 1.001)
     """
     return 1.0 + float((_DOUBLED / views) ** _FADES)
 

@@ -325,7 +325,7 @@ def test_few_views_do_not_tell_that_they_stood_still(views: int, kept: bool) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 6, 27])
 def test_three_views_by_hand(seed: int) -> None:
-    """Lens and board explain most of their motion, and a fit that begins without it ends far off, its bars too small."""
+    """Lens and board explain most of their motion: a fit that begins without it ends far off, its bars too small."""
     found = against_truth(simulated(seed, 3, 0.08, by_hand=True), CalibrationOptions())
     assert found["everywhere"] > 0.95
     assert found["rms"] < 12.0
