@@ -394,7 +394,7 @@ def _keep_refits(path: Path, key: str, refits: list[rooms.Refit]) -> None:
     import numpy as np
 
     data = io.BytesIO()
-    parts = {name: np.stack([np.asarray(getattr(one, name)) for one in refits]) for name in ("seed", "errors", "own")}
+    parts = {name: np.stack([np.asarray(getattr(one, name)) for one in refits]) for name in ("seed", "errors")}
     np.savez_compressed(data, allow_pickle=False, kcal=np.array("check"), key=np.array(key), **parts)
     write_atomic(path, data.getvalue())
 
@@ -412,10 +412,8 @@ def _kept_refits(path: Path, key: str) -> list[rooms.Refit]:
         warn(f"{path} has refits of another camera, capture, range or version of kcal; they are made anew")
         return []
     try:
-        parts = zip(
-            arrays["seed"].tolist(), *(torch.from_numpy(arrays[name]) for name in ("errors", "own")), strict=True
-        )
-        return [rooms.Refit(seed, errors, own) for seed, errors, own in parts]
+        parts = zip(arrays["seed"].tolist(), torch.from_numpy(arrays["errors"]), strict=True)
+        return [rooms.Refit(seed, errors) for seed, errors in parts]
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"{path}: damaged; remove it and start again") from error
 

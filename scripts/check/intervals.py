@@ -52,7 +52,6 @@ def judged(model: str, seed: int, refits: int) -> Record:
         "by_hand": by_hand,
         "truth": truth["everywhere"],
         "share": check.shares[0][0],
-        "own": check.own_shares[0],
         "factor": check.factors[0],
         "true": check.true,
         "fault": None if fault is None else fault.text,

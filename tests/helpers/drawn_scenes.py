@@ -155,8 +155,7 @@ def checked(repeats: int = 20) -> IntervalCheck:
     errors = torch.randn(repeats, 2, 17, 25, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     errors[..., 13:, :] *= 4.0
     stated = torch.eye(2).double().expand(2, 17, 25, 2, 2)
-    return IntervalCheck(pixels=pixels, ranges=(10.0, math.inf), stated=stated, errors=errors,
-                         own=errors.square().sum(-1), failed=0)  # fmt: skip
+    return IntervalCheck(pixels=pixels, ranges=(10.0, math.inf), stated=stated, errors=errors, failed=0)
 
 
 def bent() -> MeasuredBoard:

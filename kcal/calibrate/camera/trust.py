@@ -451,12 +451,10 @@ class Refit(NamedTuple):
         seed: of its noise and of its true camera.
         errors: (R, P, 2) px of the refitted camera at each range and place, after the best-fit rotation; NaN without an
             image. All NaN where the fit failed.
-        own: (R, P) squares of these errors over the covariances that the refitted camera states itself.
     """
 
     seed: int
     errors: Tensor
-    own: Tensor
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -468,7 +466,6 @@ class IntervalCheck:
         ranges: meters; infinity for directions.
         stated: (R, rows, columns, 2, 2) px² the covariance that the calibration states.
         errors: (K, R, rows, columns, 2) px of K refits; NaN where a camera has no image.
-        own: (K, R, rows, columns) squares of the errors over the covariances that the refits state.
         failed: refits that could not be calibrated.
     """
 
@@ -476,7 +473,6 @@ class IntervalCheck:
     ranges: tuple[float, ...]
     stated: Tensor
     errors: Tensor
-    own: Tensor
     failed: int
 
     @property
@@ -497,11 +493,6 @@ class IntervalCheck:
         each = _share_within(self.squares, (-1, -2))
         error = each.std(0) / math.sqrt(len(each)) if len(each) > 1 else torch.full_like(each[0], torch.inf)
         return list(zip(each.mean(0).tolist(), error.tolist(), strict=True))
-
-    @property
-    def own_shares(self) -> list[float]:
-        """As `shares`, of the ellipses that each refit states itself."""
-        return [float(value) for value in _share_within(self.own, (-1, -2)).mean(0)]
 
     @property
     def factors(self) -> list[float]:
@@ -617,12 +608,9 @@ def simulated_refits(
         drawn = simulated_capture(result, options, seed)
         try:
             again = drawn.calibrated(options)
-            errors = torch.stack([pixel_errors(again, drawn.camera, places, at=at) for at in ranges])
-            known = torch.stack([pixel_covariance(again, places, at=at) for at in ranges])
-            yield Refit(seed, errors, _own_squares(errors, known))
+            yield Refit(seed, torch.stack([pixel_errors(again, drawn.camera, places, at=at) for at in ranges]))
         except KcalError:
-            lost = torch.full((len(ranges), len(places)), torch.nan, dtype=torch.float64)
-            yield Refit(seed, lost[..., None].expand(-1, -1, 2), lost)
+            yield Refit(seed, torch.full((len(ranges), len(places), 2), torch.nan, dtype=torch.float64))
 
 
 @in_one_thread
@@ -648,7 +636,6 @@ def interval_check(result: CameraCalibrationResult, ranges: Sequence[float], ref
         ranges=tuple(ranges),
         stated=torch.where(known[..., None, None], stated, eye),
         errors=torch.where(known[..., None], errors, torch.nan),
-        own=torch.stack([one.own for one in kept]).reshape(len(kept), *shape),
         failed=len(done) - len(kept),
     )
 
@@ -664,14 +651,6 @@ def against_capture(
     """
     again = calibrate_camera(second, options)
     return [camera_difference(result.camera, again.camera, at=at) for at in ranges]
-
-
-def _own_squares(errors: Tensor, covariance: Tensor) -> Tensor:
-    """(...) of errors (..., 2) over covariances (..., 2, 2); NaN where these are."""
-    good = covariance.isfinite().all(-1).all(-1) & errors.isfinite().all(-1)
-    eye = torch.eye(2, dtype=torch.float64)
-    solved = torch.linalg.solve(torch.where(good[..., None, None], covariance, eye), errors.nan_to_num(0.0)[..., None])
-    return torch.where(good, (errors.nan_to_num(0.0)[..., None] * solved).sum((-1, -2)), torch.nan)
 
 
 def _possible_fit(fit: HybridFit, random: torch.Generator) -> HybridFit:

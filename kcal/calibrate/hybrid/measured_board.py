@@ -199,12 +199,6 @@ class MeasuredBoard:
         return off_by(self.board.points + torch.einsum("b,bkn->nk", self.amplitudes, shapes), self.corners)
 
     @property
-    def points_covariance(self) -> Tensor:
-        """(N, 3, 3) covariance of each corner, meters²."""
-        spread = torch.einsum("rb,bkn->rnk", self.half, board_modes(self.board.points).shapes)
-        return torch.einsum("rnk,rnl->nkl", spread, spread)
-
-    @property
     def bending(self) -> Measured:
         """Height of the corner farthest from the best plane, meters."""
         heights = self._fitted()[1][:, 2]

@@ -378,13 +378,6 @@ def test_displacements() -> None:
     torch.testing.assert_close(v - rest[:, 1], shear * x - stretch * y, rtol=0, atol=1e-10)
 
 
-def test_covariance_of_the_corners() -> None:
-    board = made(drawn())
-    slopes = torch.stack([made(step).points - PLATE.points for step in torch.eye(28, dtype=torch.float64)])
-    spread = torch.einsum("rb,bnk->rnk", board.half, slopes)
-    torch.testing.assert_close(board.points_covariance, torch.einsum("rnk,rnl->nkl", spread, spread))
-
-
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     size = torch.eye(28, dtype=torch.float64)
     for amplitudes, half in ((drawn()[:-1], size), (drawn(), size[:-1]), (drawn() / 0.0, size), (drawn(), size / 0.0)):
