@@ -48,7 +48,8 @@ def motion_findings(fit: HybridFit) -> list[Finding]:
     if views < FEW:
         text = (
             f"{views} views hardly tell whether the camera or the board moved while {lines}s were read (rolling "
-            f"shutter): error bars allow for what a hand does, some {moved:.1f} px from the first {lines} to the last"
+            f"shutter): error bars allow for a hand, some {moved:.1f} px from the first {lines} to the last, and may "
+            "still be too small"
         )
         action = f"take {FEW} views or more; or, if both stood still, leave motion out (--without motion)"
     else:
