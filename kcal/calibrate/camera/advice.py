@@ -52,8 +52,6 @@ def reached(observations: Observations, columns: int, rows: int) -> Tensor:
         >>> 0.45 < float(reached(seen, 100, 100).double().mean()) < 0.55
         True
     """
-    from scipy.spatial import ConvexHull  # which takes long to load
-
     width, height = observations.image_size
     x = (np.arange(columns) + 0.5) * (width / columns) - 0.5
     y = (np.arange(rows) + 0.5) * (height / rows) - 0.5
@@ -68,12 +66,31 @@ def reached(observations: Observations, columns: int, rows: int) -> Tensor:
         around = open_places[down, across]
         # Most views show nothing that others have not shown.
         if around.any():
-            # Half planes a x + b y + c <= 0 of the convex hull.
-            sides = ConvexHull(corners).equations
+            hull = _convex_hull(corners)
+            side_x, side_y = (np.roll(hull, -1, 0) - hull).T
             row, column = around.nonzero()
-            places = np.stack([x[across][column], y[down][row]], -1)
-            around[row, column] = ~(places @ sides[:, :2].T + sides[:, 2] <= 0).all(-1)
+            places = np.stack([x[across][column], y[down][row]], -1)[:, None] - hull
+            around[row, column] = ~(side_x * places[..., 1] >= side_y * places[..., 0]).all(-1)
     return torch.from_numpy(~open_places)
+
+
+def _convex_hull(points: np.ndarray) -> np.ndarray:
+    """(K, 2) of points (N, 2), one after the other towards y from x.
+
+    Source: A. Andrew 1979, the monotone chain. Loading SciPy's takes longer than many a calibration.
+    """
+    ordered, hull = sorted(map(tuple, points.tolist())), list[tuple[float, float]]()
+    for way in (ordered, ordered[::-1]):
+        begin = len(hull) + 1
+        for x, y in way:
+            while len(hull) > begin:
+                (x0, y0), (x1, y1) = hull[-2:]
+                if (x1 - x0) * (y - y0) > (y1 - y0) * (x - x0):
+                    break
+                hull.pop()
+            hull.append((x, y))
+        hull.pop()
+    return np.array(hull)
 
 
 def unreached_share(observations: Observations) -> float:

@@ -38,13 +38,37 @@ def homographies(board_points: Tensor, pixels: Tensor) -> Tensor:
         (V, 3, 3), scaled so that the last element is 1.
     """
     seen = torch.isfinite(pixels).all(-1)
-    board = board_points[:, :2].expand(len(pixels), -1, -1)
-    middle = torch.nanmean(pixels, 1, keepdim=True)
-    filled = torch.where(seen[..., None], pixels, middle)
-    from kornia.geometry.homography import find_homography_dlt  # kornia takes long to load
+    board, board_scale = _centered(board_points[None, :, :2], seen)
+    image, image_scale = _centered(pixels.nan_to_num(0.0), seen)
+    equations = _direct_equations(board, image, seen)
+    _, vectors = torch.linalg.eigh(equations.mT @ equations)
+    normalized = vectors[..., 0].unflatten(-1, (3, 3))
+    found: Tensor = torch.linalg.solve(image_scale, normalized @ board_scale)
+    return found / found[:, 2:, 2:]
 
-    result: Tensor = find_homography_dlt(board, filled, seen.to(pixels.dtype), solver="svd")
-    return result
+
+def _centered(points: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (V, N, 2) about the middle of those that are seen (V, N), at mean distance √2; the maps (V, 3, 3) to these.
+
+    Source: Hartley and Zisserman, Multiple View Geometry, section 4.4.4.
+    """
+    weight = seen.to(points.dtype)[..., None]
+    count = weight.sum(1, keepdim=True)
+    middle = (points * weight).sum(1, keepdim=True) / count
+    distance = ((points - middle) * weight).norm(dim=-1, keepdim=True).sum(1, keepdim=True) / count
+    scale = math.sqrt(2.0) / distance[..., 0]
+    to = torch.diag_embed(torch.cat([scale, scale, torch.ones_like(scale)], -1))
+    to[:, :2, 2] = -scale * middle[:, 0]
+    return (points - middle) * scale[..., None], to
+
+
+def _direct_equations(board: Tensor, image: Tensor, seen: Tensor) -> Tensor:
+    """(V, 2 N, 9) equations of the direct linear transform from points (V, N, 2); zero where none is seen (V, N)."""
+    weight = seen.to(image.dtype)[..., None]
+    at = torch.nn.functional.pad(board, (0, 1), value=1.0) * weight
+    zero = torch.zeros_like(at)
+    rows = [torch.cat([at, zero, -image[..., :1] * at], -1), torch.cat([zero, at, -image[..., 1:] * at], -1)]
+    return torch.cat(rows, -2)
 
 
 def spread_out(board_points: Tensor, pixels: Tensor) -> Tensor:
@@ -60,12 +84,8 @@ def spread_out(board_points: Tensor, pixels: Tensor) -> Tensor:
         (V,) bool.
     """
     low, high = board_points[:, :2].amin(0), board_points[:, :2].amax(0)
-    x, y = ((2.0 * board_points[:, :2] - low - high) / (high - low)).unbind(-1)
-    one, zero = torch.ones_like(x), torch.zeros_like(x)
-    upper = torch.stack([x, y, one, zero, zero, zero, -x * x, -x * y, -x], -1)
-    lower = torch.stack([zero, zero, zero, x, y, one, -x * y, -y * y, -y], -1)
-    seen = torch.isfinite(pixels).all(-1).to(pixels.dtype)[..., None]
-    values = torch.linalg.svdvals(torch.cat([seen * upper, seen * lower], -2))
+    board = ((2.0 * board_points[:, :2] - low - high) / (high - low))[None]
+    values = torch.linalg.svdvals(_direct_equations(board, board, torch.isfinite(pixels).all(-1)))
     return values[..., 7] > 1e-9 * values[..., 0]
 
 
