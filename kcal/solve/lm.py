@@ -210,6 +210,9 @@ class Linearization(Protocol):
         ...
 
 
+Bend = Callable[[S, State, Any, Tensor], State | None]
+
+
 class Problem(Protocol[S]):
     """A least-squares problem: residuals r(state), their Jacobian, and how a step is applied.
 
@@ -423,6 +426,7 @@ def minimize(
     callback: Callback | None = None,
     *,
     unroll: bool = False,
+    bend: Bend[S] | None = None,
 ) -> Result[S]:
     """Minimize half the sum of squares by the Levenberg-Marquardt method.
 
@@ -439,6 +443,8 @@ def minimize(
         callback: called after each trial with the trial's number and the best cost; return True to stop.
         unroll: record the accepted steps for autograd, as far as the problem's operations are differentiable. What
             decides about them (damping, acceptance) counts as constant.
+        bend: of problems without a batch: maps a state, a step that raised the cost, the linearization and the damping
+            to a step that is right to second order, or None. It is tried before a shorter one.
 
     Returns:
         The best state with its status. Nothing is raised for a failure to converge: read `status`.
@@ -450,10 +456,12 @@ def minimize(
         ([3.0, -1.0], True)
     """
     with torch.set_grad_enabled(unroll and torch.is_grad_enabled()):
-        return _minimize(problem, start, options or LMOptions(), callback)
+        return _minimize(problem, start, options or LMOptions(), callback, bend)
 
 
-def _minimize(problem: Problem[S], start: S, options: LMOptions, callback: Callback | None) -> Result[S]:
+def _minimize(
+    problem: Problem[S], start: S, options: LMOptions, callback: Callback | None, bend: Bend[S] | None
+) -> Result[S]:
     state = start
     linear = problem.linearize(state)
     device = linear.cost.device
@@ -506,6 +514,10 @@ def _minimize(problem: Problem[S], start: S, options: LMOptions, callback: Callb
         candidate = problem.retract(state, step)
         joint = problem.linearize(candidate) if problem.joint else None
         new_cost = on_host(problem.cost(candidate) if joint is None else joint.cost)
+        if bend is not None and solved and not new_cost < cost:
+            bent = bend(state, step, linear, on_device(damping))
+            if bent is not None and (other_cost := on_host(problem.cost(other := problem.retract(state, bent)))) < cost:
+                candidate, new_cost = other, other_cost
         # An infinite fall over an infinite prediction is no gain, and not accepted.
         with np.errstate(invalid="ignore"):
             gain = (cost - np.where(np.isfinite(new_cost), new_cost, np.inf)) / np.where(

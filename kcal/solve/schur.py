@@ -116,12 +116,12 @@ class SchurLinearization:
             total = total + shared_gram
         return cls(gram[..., :L, :L], gram[..., :L, L:], total)
 
-    def solve(self, shared: Tensor, local: Tensor) -> State:
-        """The solution of the system for another right side ((..., S), (..., V, L)), which is not damped."""
+    def solve(self, shared: Tensor, local: Tensor, damping: Tensor | None = None) -> State:
+        """The solution of the system for another right side ((..., S), (..., V, L)); not damped if not told."""
         out = copy.copy(self)
         out._right = torch.cat([self._right[..., :-1], (local * self._local_scale)[..., None]], -1)
         out._shared_gradient = shared * self._shared_scale
-        (by_shared, by_local), _ = out.step(torch.zeros_like(self.cost))
+        (by_shared, by_local), _ = out.step(torch.zeros_like(self.cost) if damping is None else damping)
         return -by_shared, -by_local
 
     def blend(self, mask: Tensor, other: SchurLinearization) -> SchurLinearization:

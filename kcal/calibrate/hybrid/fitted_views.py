@@ -251,7 +251,7 @@ class FittedViews:
         options = LMOptions(
             max_iterations=steps, tolerance=gain / self.freedom, initial_damping=1e-10, last_step=last_step
         )
-        result = minimize(problem, estimate.state, options)
+        result = minimize(problem, estimate.state, options, bend=problem.bent)
         return problem, estimate._replace(state=result.state), int(result.iterations)
 
     def data(self, problem: BoardProblem, estimate: Estimate) -> ViewData:

@@ -66,6 +66,8 @@ def apply_twist(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Te
 # Of a hybrid lens there may be hundreds of derivatives. They are written where they belong, each once, and what the
 # cost of a trial step needed of them is kept for the linearization that follows.
 
+# Share of a step over which residuals bend.
+_AHEAD = 0.1
 # All views.
 ALL = slice(None)
 # Numbers of a pose's step, and of its turn alone.
@@ -678,6 +680,25 @@ class BoardProblem(SchurProblem[BoardState]):
         rotation, translation = apply_twist(state.rotation, state.translation, twist)
         motion = state.motion if self.readout is None else state.motion + local[..., self.pose :]
         return BoardState(parameters, board, rotation, translation, motion)
+
+    def bent(self, state: BoardState, step: State, linear: SchurLinearization, damping: Tensor) -> State | None:
+        """A step along the curve on which residuals change linearly, to second order; None beyond the lens.
+
+        Focal length, shape and field of a fisheye can nearly replace each other. Its cost is then a narrow valley that
+        bends, and straight steps along it must be short.
+
+        Source: M. Transtrum, B. Machta, J. Sethna 2011, Phys. Rev. E 83, 036701: geodesic acceleration.
+        """
+        ahead, back = (self.retract(state, (way * step[0], way * step[1])) for way in (_AHEAD, -_AHEAD))
+        second = (self.residuals(ahead) + self.residuals(back) - 2.0 * self.residuals(state)) / _AHEAD**2
+        if not bool(second.isfinite().all()):
+            return None
+        by_view = torch.cat(
+            [(self.rows(state, views) @ second[views, :, None])[..., 0] for views in self._chunks(state)]
+        )
+        L = self.local_size
+        shared, local = linear.solve(by_view[:, L:-1].sum(0)[self.moving], by_view[:, :L], damping)
+        return step[0] - 0.5 * shared, step[1] - 0.5 * local
 
     def tidy(self, state: BoardState) -> BoardState:
         """The state with its rotations made orthonormal again after many small steps."""
