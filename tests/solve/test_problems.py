@@ -372,3 +372,20 @@ def test_without_a_last_step_the_solution_is_where_the_problem_was_linearized() 
     assert not bool(before.converged)
     assert int(short.iterations) == int(whole.iterations) == len(short.history) - 1
     assert float(short.cost) == float(short.history[-1]) == float(before.cost) > float(whole.cost)
+
+
+def test_a_step_that_raises_the_cost_is_bent_before_it_is_shortened() -> None:
+    """The valley of Rosenbrock's function is a parabola; a bend that follows it leads to the minimum at once."""
+    start, problem = (vector(-1.2, 1.0),), DenseProblem(rosenbrock, batch=())
+    options = LMOptions(initial_damping=1e-10)
+
+    def bend(state: tuple[Tensor], step: tuple[Tensor], *_: object) -> tuple[Tensor]:
+        across = step[0][0]
+        return (torch.stack([across, (state[0][0] + across).square() - state[0][1]]),)
+
+    straight, bent = (minimize(problem, start, options, bend=way) for way in (None, bend))
+    assert int(bent.iterations) <= 2 < int(straight.iterations)
+    torch.testing.assert_close(bent.state[0], torch.ones_like(bent.state[0]), rtol=0, atol=1e-9)
+    # What it bends without a gain is shortened as ever.
+    worse = minimize(problem, start, options, bend=lambda state, step, *_: (100.0 * step[0],))
+    assert int(worse.iterations) == int(straight.iterations)

@@ -48,7 +48,7 @@ def homographies(board_points: Tensor, pixels: Tensor) -> Tensor:
 
 
 def _centered(points: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (V, N, 2) about the middle of those that are seen (V, N), at mean distance √2; the maps (V, 3, 3) to these.
+    """Points (V, N, 2) about the middle of those that are seen (V, N), √2 away on average; the maps (V, 3, 3) to these.
 
     Source: Hartley and Zisserman, Multiple View Geometry, section 4.4.4.
     """

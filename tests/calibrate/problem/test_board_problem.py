@@ -385,3 +385,34 @@ def test_selected_elements_are_their_own_problem(own_pixels: bool) -> None:
     torch.testing.assert_close(part.rows(some), together.rows(state)[chosen], rtol=1e-13, atol=1e-14)
     torch.testing.assert_close(part.cost(some), together.cost(state)[chosen])
     assert BoardProblem(BOARD.points, pixels, model).select(chosen) is None
+
+
+def test_a_bent_step_is_right_to_second_order() -> None:
+    """From twice as far off exact corners, the cost that a straight step leaves grows 2⁴ times, of a bent one 2⁶."""
+    pixels, model, state = scene("opencv4")
+    shown = Camera(state.parameters, model=model, size=(1, 1)).project(
+        BoardProblem(BOARD.points, pixels, model).points(state)
+    )
+    problem = BoardProblem(BOARD.points, shown[0], model, [0, 1, 5, 6])
+    left = []
+    for size in (0.02, 0.04):
+        away = torch.full((4,), size, dtype=torch.float64), torch.full((VIEWS, 6), size, dtype=torch.float64)
+        begun, damping = problem.retract(state, away), torch.tensor(1e-12, dtype=torch.float64)
+        linear = problem.linearize(begun)
+        step, _ = linear.step(damping)
+        bent = problem.bent(begun, step, linear, damping)
+        assert bent is not None
+        left.append([float(problem.cost(problem.retract(begun, way))) for way in (step, bent)])
+    (straight, curved), (straight_twice, curved_twice) = left
+    assert straight_twice > 15.0 * straight
+    assert curved_twice > 60.0 * curved
+    assert curved_twice < 0.05 * straight_twice
+
+
+def test_a_step_beyond_the_lens_is_not_bent() -> None:
+    pixels, model, state = scene("opencv4")
+    problem = BoardProblem(BOARD.points, pixels, model, [0, 1, 5, 6])
+    linear, damping = problem.linearize(state), torch.tensor(0.0, dtype=torch.float64)
+    behind = torch.zeros(VIEWS, 6, dtype=torch.float64)
+    behind[0, 5] = -20.0
+    assert problem.bent(state, (torch.zeros(4, dtype=torch.float64), behind), linear, damping) is None
