@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import board_modes
+from kcal.calibrate.hybrid.fit import check_tilts
 from kcal.calibrate.problem.views import Views, poses_under
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
@@ -208,9 +209,6 @@ def _emptiest(seen: Tensor) -> str:
 
 # Directions less certain than this are no calibration: 5 % of range at every distance.
 _MOST = 0.05
-# Degrees of one direction within which all boards are alike: halves of 49 views within 5.1 gave 999 ± 31 and
-# 589 ± 14 px; those of 25 views within 7.2 agree within their error bars.
-_ALIKE = 6.0
 # Corners that stand for all: more change nothing.
 _CORNERS = 400
 
@@ -254,26 +252,6 @@ def direction_share(parameters: Tensor, model: LensModel, points: Tensor, covari
     pixels = seen.pixels[:, good]
     spread = (pixels - pixels.mean(1, keepdim=True)).square().sum()
     return float((variance / spread).sqrt()) if float(spread) > 0 else math.inf
-
-
-class AlikeError(DegenerateError):
-    """All boards are tilted alike, as those of any part of the views then are."""
-
-
-def check_tilts(rotation: Tensor) -> None:
-    """Raise `AlikeError` where all views (V, 3, 3), cam_from_board, show the board tilted alike.
-
-    Whatever shape of the print or of the lens that tilts all of them alike is then taken for the focal length.
-    """
-    normals = torch.nn.functional.normalize(rotation[..., 2] * rotation[..., 2, 2:].sign(), dim=-1)
-    middle = torch.nn.functional.normalize(normals.sum(0), dim=0)
-    apart = float(torch.rad2deg(torch.acos((normals @ middle).clamp(max=1.0))).max())
-    if apart < _ALIKE:
-        raise AlikeError(
-            f"the board is tilted alike in all {len(rotation)} views (within {apart:.1f}° of one direction): they do "
-            "not determine the focal length, which other views of the same kind give otherwise; add views with the "
-            "board tilted by 30 to 45 degrees to the left, right, top and bottom"
-        )
 
 
 def check_directions(

@@ -17,9 +17,7 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.advice import (
-    AlikeError,
     check_directions,
-    check_tilts,
     roll_findings,
     what_to_photograph,
 )
@@ -51,7 +49,7 @@ from kcal.calibrate.camera.warnings import (
     pupil_findings,
     spacing_findings,
 )
-from kcal.calibrate.hybrid.fit import FitOptions, FitStart, HybridFit, fit_hybrid, rough_start
+from kcal.calibrate.hybrid.fit import AlikeError, FitOptions, FitStart, HybridFit, fit_hybrid, rough_start
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding
@@ -74,7 +72,6 @@ def calibrate_hybrid(
         start = rough_start(
             board, pixels, observations.image_size, weights, options.of_fit(observations.image_size), progress
         )
-        check_tilts(start.estimate.state.rotation)
         weights = corner_weights(observations, start.residuals)
     fit = fit_by_options(observations, pixels, weights, start, options, progress)
     return hybrid_result(observations, fit, options)

@@ -174,43 +174,32 @@ class Integrated(NamedTuple):
         reach = matrix_product(self.half.flatten(0, 1), direction).view(self.half.shape)
         E = matrix_product(self.inverse.transpose(1, 2) / math.sqrt(variance * tempering), reach)
         mean, others, kept = E[..., 0], E[..., 1:], own.diagonal(dim1=1, dim2=2)
-        by_order = (kept.shape[1] // AXES, AXES)
+        # Numbers of one amplitude count together: within a view, and across all views.
+        number = torch.from_numpy(amplitudes_of(amplitudes))
+        together = torch.nn.functional.one_hot(number, amplitudes).to(E.dtype).T
         G = others @ others.transpose(1, 2)
         moment = mean.square() + G.diagonal(dim1=1, dim2=2)
-        first = ((1.0 - kept) / tempering - moment).sum(0).view(by_order).sum(1)
-        # By pairs of orders: within a view, and across all views.
+        first = together @ ((1.0 - kept) / tempering - moment).sum(0)
         within = (-0.5 * own.square() / tempering - own * (mean[:, :, None] * mean[:, None]) - own * G).sum(0)
         within.diagonal().add_((0.5 * kept / tempering + 0.5 * moment).sum(0))
-        second = 4.0 * within.view(*by_order, *by_order).sum((1, 3))
-        orders = others.unflatten(1, by_order).transpose(0, 1).flatten(1, 2)
-        along = (orders.transpose(1, 2) @ mean.unflatten(1, by_order).transpose(0, 1).flatten(1)[..., None])[..., 0]
+        along = together @ (others * mean[..., None]).sum(0)
         # Of E times the inverse, a row for each motion, only sums over motions are wanted.
         mixed = along @ inverse
-        if orders.shape[1] < orders.shape[2]:
+        rows = others.flatten(0, 1)
+        if len(rows) ** 2 < amplitudes * size**2:
             # Few views have fewer rows than there are unknowns.
-            pairs = (
-                products_of(orders.flatten(0, 1))
-                .square()
-                .unflatten(0, (len(orders), -1))
-                .unflatten(2, (len(orders), -1))
-            )
-            across, squared = pairs.sum((1, 3)), matrix_product(orders, inverse).square().sum(1)
+            pairs = products_of(rows).square().unflatten(0, others.shape[:2]).unflatten(2, others.shape[:2])
+            across = together @ pairs.sum((0, 2)) @ together.T
+            squared = together @ matrix_product(rows, inverse).square().view(others.shape).sum(0)
         else:
-            spread = torch.stack([products_of(rows.T) for rows in orders])
-            across, squared = (
-                spread.flatten(1) @ spread.flatten(1).T,
-                (matrix_product(spread, inverse) * inverse).sum(1),
-            )
-        second -= 4.0 * (along @ along.T) + 2.0 * across
+            parts = others.split(number.bincount().tolist(), 1)
+            spread = torch.stack([products_of(part.flatten(0, 1).T) for part in parts])
+            across = spread.flatten(1) @ spread.flatten(1).T
+            squared = (matrix_product(spread, inverse) * inverse).sum(1)
+        second = 4.0 * (together @ within @ together.T - along @ along.T) - 2.0 * across
         Y = torch.from_numpy(y)
-        by_variance = -(2.0 * mixed * Y + squared)
-        by_noise = mean.square().sum(0).view(by_order).sum(1) + 2.0 * mixed @ Y + squared.sum(-1)
-        # The last amplitude may be that of several threes.
-        each, sums = np.arange(amplitudes), np.add.reduceat
-        return Slopes(
-            sums(first.numpy(), each), sums(sums(second.numpy(), each), each, 1), sums(by_variance.numpy(), each),
-            sums(by_noise.numpy(), each),
-        )  # fmt: skip
+        by_noise = together @ mean.square().sum(0) + 2.0 * mixed @ Y + squared.sum(-1)
+        return Slopes(first.numpy(), second.numpy(), -(2.0 * mixed * Y + squared).numpy(), by_noise.numpy())
 
 
 class Slopes(NamedTuple):
