@@ -286,11 +286,11 @@ def negative_log_evidence(
 class _Best(NamedTuple):
     """-ln p, and the best lens and board: δ (S,), and in units of their priors y (S,); what derivatives need."""
 
-    value: np.ndarray
+    value: float
     step: np.ndarray
     y: np.ndarray
     deviation: np.ndarray
-    rss: np.ndarray
+    rss: float
     root: Tensor
 
 
@@ -314,32 +314,27 @@ class _Posterior(NamedTuple):
     by_h: np.ndarray
 
 
-def _best(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: np.ndarray | float) -> _Best:
-    """Also of many at once: hyperparameters (..., H), ln σ² (...), and data whose products may have these dimensions.
-
-    The value is infinite where priors are too wide for the precision of numbers, or noise is beyond them.
-    """
-    products, held = data.products.numpy(), np.minimum(log_variance, _HIGHEST)
-    K, g, c, s2 = products[..., :-1, :-1], -products[..., :-1, -1], products[..., -1, -1], np.exp(held)
-    d = families.deviation(torch.from_numpy(h)).numpy()
-    weighed = d / s2[..., None]
-    A = torch.from_numpy(K * d[..., :, None] * weighed[..., None, :])
-    A.diagonal(dim1=-2, dim2=-1).add_(1.0)
-    root, info = torch.linalg.cholesky_ex(A)
+def _best(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Best:
+    """The value is infinite where priors are too wide for the precision of numbers, or noise is beyond them."""
+    K, g, held = data.K.numpy(), data.g.numpy(), min(log_variance, _HIGHEST)
+    s2, d = math.exp(held), families.deviation(torch.from_numpy(h)).numpy()
+    A = K * d[:, None]
+    A *= d / s2
+    A[np.diag_indices(len(d))] += 1.0
+    root, info = torch.linalg.cholesky_ex(torch.from_numpy(A))
     # The solution in units of the priors.
     y = np.divide(data.at.numpy(), d, out=np.zeros_like(d), where=d > 0)
-    change = torch.cholesky_solve(torch.from_numpy(weighed * g - y)[..., None], root)[..., 0].numpy()
+    change = torch.cholesky_solve(torch.from_numpy(d / s2 * g - y)[:, None], root)[:, 0].numpy()
     y, step = y + change, d * change
-    rss = c - 2 * (g * step).sum(-1) + (step * (K @ step[..., None])[..., 0]).sum(-1)
-    half_log = root.diagonal(dim1=-2, dim2=-1).log().sum(-1).numpy()
-    value = 0.5 * (data.freedom * held + rss / s2 + (y * y).sum(-1)) + half_log
-    return _Best(np.where((info.numpy() == 0) & (held < _HIGHEST), value, np.inf), step, y, d, rss, root)
+    rss = float(data.c - 2 * g @ step + step @ K @ step)
+    value = 0.5 * (data.freedom * held + rss / s2 + float(y @ y)) + float(root.diagonal().log().sum())
+    return _Best(value if not int(info) and held < _HIGHEST else math.inf, step, y, d, rss, root)
 
 
 def _posterior(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_variance: float) -> _Posterior | None:
     """The posterior with its derivatives; None where priors are too wide for the precision of numbers."""
     best = _best(data, families, h, log_variance)
-    if not np.isfinite(best.value):
+    if not math.isfinite(best.value):
         return None
     Q = torch.linalg.solve_triangular(best.root, torch.eye(len(best.y), dtype=best.root.dtype), upper=False)
     M, y, s2 = matrix_product(Q.T, Q).numpy(), best.y, math.exp(-log_variance)
@@ -351,11 +346,11 @@ def _posterior(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_vari
     mixed = y * My - 0.5 * (kept - squared.sum(0))
     by_h, again = families.log_variance_slopes(torch.from_numpy(h))
     slope, across = by_a @ by_h, mixed @ by_h
-    rss = float(best.rss)
+    rss = best.rss
     noise = 0.5 * (data.freedom - (len(y) - float(kept.sum())) - rss * s2)
     by_noise = 0.5 * (float(kept.sum()) - float(squared.sum()) + rss * s2) - float(y @ My)
     whole = np.block([[by_h.T @ bend @ by_h + np.diag(by_a @ again), across[:, None]], [across, by_noise]])
-    return _Posterior(float(best.value), np.append(slope, noise), whole, best, Q, by_h)
+    return _Posterior(best.value, np.append(slope, noise), whole, best, Q, by_h)
 
 
 # The logarithms of motions' standard deviations over the noise, of views that stand still.
@@ -467,15 +462,12 @@ class EvidenceLoss:
         self._data, self._families, self._tempering = data, families, tempering
         self._mean, self._sd, self._by_hand = prior.mean.numpy(), prior.sd.numpy(), prior.by_hand
 
-    def values(self, many: np.ndarray) -> np.ndarray:
-        """(N,) values of many v (N, H + 5) without derivatives, far cheaper; infinite where numbers overflow."""
-        data, determinants = self._data.still, np.zeros(len(many))
-        if self._data.moving:
-            each = [self._data.integrated(self._parts(v)[1]) for v in many]
-            data = data._replace(products=torch.stack([one.data.products for one in each]))
-            determinants = np.array([one.log_determinant for one in each])
-        best = _best(data.tempered(self._tempering), self._families, many[:, : len(self._mean)], many[:, -1])
-        return best.value + np.array([self._beside(*pair) for pair in zip(many, determinants, strict=True)])
+    def value(self, v: np.ndarray) -> float:
+        """The value without derivatives, far cheaper; infinite where numbers overflow."""
+        h, ratio, log_variance = self._parts(v)
+        one = self._data.integrated(ratio)
+        best = _best(one.data.tempered(self._tempering), self._families, h, log_variance)
+        return best.value + self._beside(v, one.log_determinant)
 
     def __call__(self, v: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """The value, its gradient, and its Hessian; infinite beyond numbers."""
@@ -551,7 +543,7 @@ def evidence_of_motion(
     for view, ratios in ((data.only(rest), best.log_ratio[rest]), (data, best.log_ratio)):
         one = view.integrated(ratios)
         found = _best(one.data.tempered(tempering), families, best.h.numpy(), log_variance)
-        losses.append(float(found.value) + 0.5 * one.log_determinant / tempering + view.unequal)
+        losses.append(found.value + 0.5 * one.log_determinant / tempering + view.unequal)
     return losses[0] - losses[1]
 
 
@@ -559,11 +551,11 @@ def evidence_of_corners(
     data: ViewData, best: Amplitudes, families: PriorFamilies, tempering: float, sizes: Sequence[float]
 ) -> np.ndarray:
     """Gain of the log evidence (nats) by corners displaced by each of these amplitudes, all others unchanged."""
-    h = best.h.numpy()[None].repeat(1 + len(sizes), 0)
-    h[:, -1] = [_NOWHERE, *np.log(sizes)]
-    still = data.integrated(best.log_ratio).data.tempered(tempering)
-    value = _best(still, families, h, np.full(len(h), math.log(best.variance))).value
-    return np.asarray(value[0] - value[1:])
+    h, log_variance = best.h.numpy().copy(), math.log(best.variance)
+    still, values = data.integrated(best.log_ratio).data.tempered(tempering), []
+    for h[-1] in (_NOWHERE, *np.log(sizes)):
+        values.append(_best(still, families, h, log_variance).value)
+    return values[0] - np.array(values[1:])
 
 
 # How much the board bends in each view, relative to the others.
@@ -631,7 +623,7 @@ def expected_maximum(
         raise ArithmeticError("the views contradict each other so far that the evidence of their lens is no number")
     found = expected_amplitudes(
         bend,
-        loss.values,
+        loss.value,
         at,
         which,
         hyper_bounds(hyperprior, len(best.log_ratio), log_variance),
@@ -641,7 +633,7 @@ def expected_maximum(
 
 def expected_amplitudes(
     bend: np.ndarray,
-    values: Callable[[np.ndarray], np.ndarray],
+    value: Callable[[np.ndarray], float],
     at: np.ndarray,
     which: list[int],
     bounds: list[tuple[float, float | None]],
@@ -650,14 +642,14 @@ def expected_amplitudes(
 
     Args:
         bend: (H, H) the Hessian of -ln p.
-        values: -ln p alone, (N,) of places (N, H).
+        value: -ln p alone, of a place (H,).
         at: (H,) where it is smallest.
         which: numbers of the ln A.
         bounds: of all.
 
     Example:
         >>> def loss(v):  # ln A is normal, with a standard deviation of a half: <A²> = exp(2 · ¼)
-        ...     return 2.0 * (v * v).sum(-1)
+        ...     return 2.0 * float(v @ v)
         >>> found = expected_amplitudes(4.0 * np.eye(2), loss, np.zeros(2), [0], [(-9.0, 9.0), (-9.0, None)])
         >>> [round(float(value), 2) for value in found]
         [0.25, 0.0]
@@ -669,7 +661,7 @@ def expected_amplitudes(
         low, high = bounds[i]
         places = np.array([t for t in sigma * _PLACES if low <= at[i] + t <= (math.inf if high is None else high)])
         along = covariance[:, i] / covariance[i, i]
-        losses = values(at + places[:, None] * along)
+        losses = np.array([value(at + place * along) for place in places])
         share = np.exp(losses.min() - losses)
         found[i] += 0.5 * math.log(float(share @ np.exp(2.0 * places)) / float(share.sum()))
     return found

@@ -93,13 +93,13 @@ def test_value_is_the_density_of_the_residuals(moving: bool) -> None:
     w = (AT[2:6] + 0.5 * AT[-1] - math.log(MEDIAN)) / SPREAD if moving else np.zeros(0)
     wanted = density(moving) + 0.5 * float(z @ z + w @ w)
     loss = EvidenceLoss(data(moving), FAMILIES, PRIOR, 1.0)
-    assert loss.values(vector(moving)[None])[0] == pytest.approx(wanted, rel=1e-10)
+    assert loss.value(vector(moving)) == pytest.approx(wanted, rel=1e-10)
     assert loss(vector(moving))[0] == pytest.approx(wanted, rel=1e-10)
 
 
 def check_derivatives(loss: EvidenceLoss, at: np.ndarray) -> None:
     steps = 1e-5 * np.eye(len(at))
-    slopes = [float(np.subtract(*loss.values(np.stack([at + step, at - step])))) / 2e-5 for step in steps]
+    slopes = [(loss.value(at + step) - loss.value(at - step)) / 2e-5 for step in steps]
     _, found, bend = loss(at)
     np.testing.assert_allclose(found, slopes, rtol=1e-6, atol=1e-6)
     bends = [(loss(at + step)[1] - loss(at - step)[1]) / 2e-5 for step in steps]
@@ -153,9 +153,7 @@ def test_factors_of_views_are_the_most_likely() -> None:
 
     def loss(factors: torch.Tensor) -> float:
         whole = begun._replace(relative=factors)
-        return float(
-            EvidenceLoss(whole, held, PRIOR, 1.0).values(np.concatenate([AT[:2], [0.4], [math.log(0.5)]])[None])[0]
-        )
+        return EvidenceLoss(whole, held, PRIOR, 1.0).value(np.concatenate([AT[:2], [0.4], [math.log(0.5)]]))
 
     here = loss(relative)
     for k in range(VIEWS):
@@ -174,7 +172,7 @@ def test_derivatives_of_a_single_view() -> None:
 def test_beyond_numbers_is_worse_than_anything() -> None:
     loss, at = EvidenceLoss(data(False), FAMILIES, PRIOR, 1.0), vector(False)
     beyond = at + np.array([0.0, 0.0, 400.0])
-    assert loss.values(beyond[None])[0] == math.inf
+    assert loss.value(beyond) == math.inf
     assert loss(beyond)[0] == math.inf
 
 
@@ -239,8 +237,8 @@ def weights_seen(sizes: list[float], sigma: float) -> Loss:
     return loss
 
 
-def values_of(loss: Loss) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda many: np.array([loss(v)[0] for v in many])
+def value_of(loss: Loss) -> Callable[[np.ndarray], float]:
+    return lambda v: loss(v)[0]
 
 
 def smallest(loss: Loss) -> np.ndarray:
@@ -254,7 +252,7 @@ def test_mean_square_is_that_of_the_integral(sizes: list[float]) -> None:
     """Where the amplitude is well determined, where it is not, and where nothing but an upper bound is known."""
     loss = weights_seen(sizes, 0.2)
     at = smallest(loss)
-    found = expected_amplitudes(bend(loss, at), values_of(loss), at, [0], WIDE)
+    found = expected_amplitudes(bend(loss, at), value_of(loss), at, [0], WIDE)
 
     def density(x: float, power: float) -> float:
         return math.exp(loss(at)[0] - loss(np.array([x, 0.0, 0.0]))[0] + power * x)
@@ -273,7 +271,7 @@ def test_others_follow() -> None:
     def loss(v: np.ndarray) -> tuple[float, np.ndarray]:
         return 0.5 * float(v @ precision @ v), precision @ v
 
-    found = expected_amplitudes(precision, values_of(loss), np.zeros(2), [0, 1], WIDE[:2])
+    found = expected_amplitudes(precision, value_of(loss), np.zeros(2), [0, 1], WIDE[:2])
     # ln A has a variance of 1 each: ½ ln <A²> = 1.
     assert found == pytest.approx([1.0, 1.0], abs=0.02)
 
@@ -282,7 +280,7 @@ def test_bounds_hold() -> None:
     loss = weights_seen([0.01, 0.02], 0.2)
     at = smallest(loss)
     top = float(at[0]) + 0.4
-    found = expected_amplitudes(bend(loss, at), values_of(loss), at, [0], [(-12.0, top), *WIDE[1:]])
+    found = expected_amplitudes(bend(loss, at), value_of(loss), at, [0], [(-12.0, top), *WIDE[1:]])
     assert at[0] - 1.0 < found[0] <= top
 
 
