@@ -682,10 +682,7 @@ class BoardProblem(SchurProblem[BoardState]):
         return BoardState(parameters, board, rotation, translation, motion)
 
     def bent(self, state: BoardState, step: State, linear: SchurLinearization, damping: Tensor) -> State | None:
-        """A step along the curve on which residuals change linearly, to second order; None beyond the lens.
-
-        Focal length, shape and field of a fisheye can nearly replace each other. Its cost is then a narrow valley that
-        bends, and straight steps along it must be short.
+        """A step along the bent valley in which focal length, shape and field of a fisheye lie; None beyond the lens.
 
         Source: M. Transtrum, B. Machta, J. Sethna 2011, Phys. Rev. E 83, 036701: geodesic acceleration.
         """
@@ -693,10 +690,8 @@ class BoardProblem(SchurProblem[BoardState]):
         second = (self.residuals(ahead) + self.residuals(back) - 2.0 * self.residuals(state)) / _AHEAD**2
         if not bool(second.isfinite().all()):
             return None
-        by_view = torch.cat(
-            [(self.rows(state, views) @ second[views, :, None])[..., 0] for views in self._chunks(state)]
-        )
-        L = self.local_size
+        parts = [(self.rows(state, views) @ second[views, :, None])[..., 0] for views in self._chunks(state)]
+        by_view, L = torch.cat(parts), self.local_size
         shared, local = linear.solve(by_view[:, L:-1].sum(0)[self.moving], by_view[:, :L], damping)
         return step[0] - 0.5 * shared, step[1] - 0.5 * local
 
