@@ -43,7 +43,8 @@ NAMES = {
     "locate.ViewMarks": "`kcal.locate.Marks`", "locate.read_views": "`kcal.locate.read_marks`",
     "locate.GroundPlaces": "result of `kcal.locate_points`",
     "locate.locate_on_ground":
-    "`kcal.locate_points` of a rig of one", "locate.locate_views": "`kcal.locate_points`", "rig.load_camera_rig": "`kcal.load_rig`",
+    "`kcal.locate_points` of a rig of one", "locate.locate_views": "`kcal.locate_points`",
+    "rig.load_camera_rig": "`kcal.load_rig`",
     "rig.save_camera_rig": "`kcal.save_rig`", "rig.CameraRigCalibration": "`kcal.lens.calibration.RigCalibration`",
     "rig.LandmarkEffect": "`kcal.rig.Effect`", "stars.StarEffect": "`kcal.rig.Effect`",
     "rig.SourceResidual": "`kcal.lens.calibration.RigSource`",
