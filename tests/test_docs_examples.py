@@ -136,7 +136,9 @@ def test_a_command_is_accepted(words: list[str], settings: dict[str, Any]) -> No
 
 @pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
 def test_commands_in_the_text_exist(page: Path) -> None:
-    for span in re.findall(r"`kcal ([a-z][^`]*)`", page.read_text(encoding="utf-8").replace("\n", " ")):
+    # What 1.0 had stands first in the rows of the table of changes.
+    text = re.sub(r"^\| `.*?` \|", "|", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    for span in re.findall(r"`kcal ([a-z][^`]*)`", text.replace("\n", " ")):
         command, arguments = resolve(span.split())
         known = {name for option in command.params for name in option.opts} | {"--help"}
         assert [word for word in arguments if word.startswith("-") and word.split("=")[0] not in known] == [], span

@@ -150,13 +150,14 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[rooms.Point
         )  # fmt: skip
     else:
         localize = pair_localizer(solved, own, noise)
+        whole = localize(solved)
         if own.history is not None:
-            # Loads OpenCV and SciPy, which nothing else here needs.
-
+            # Moments add what is not known of them.
+            whole.included = ("marks", "calibration", "mounting")
             by_moments = rooms.located_at(
                 own.history, solved, lambda rig: rooms.PointLocator(localize(rig), geoid=geoid)
             )
-        locate = rooms.PointLocator(localize(solved), geoid=geoid)
+        locate = rooms.PointLocator(whole, geoid=geoid)
 
     def parts() -> Iterator[LocatedPart]:
         for marks, read in rooms.read_mark_chunks(points, solved.names, single=many):

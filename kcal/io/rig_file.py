@@ -141,8 +141,12 @@ class RigFile(NativeFile):
             raise ValueError(f"{len(self.names)} names, {len(self.cameras)} cameras and {len(self.poses)} poses")
         if len(set(self.names)) != len(self.names) or not all(self.names):
             raise ValueError(f"unlike names are needed, got {', '.join(self.names)}")
-        if len(self.names) != 2 and self.mounting is not None:
-            raise ValueError(f"mounting is that of two cameras; there are {len(self.names)}")
+        if self.mounting is not None:
+            if len(self.names) != 2:
+                raise ValueError(f"mounting is that of two cameras; there are {len(self.names)}")
+            still = RigPose(rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), translation=(0.0, 0.0, 0.0))
+            if self.origin is not None or self.poses[0] != still:
+                raise ValueError("mounting is that of the left camera, whose frame must be the rig's")
         lenses = sum(len(camera.coefficients) + len(INTRINSICS) for camera in self.cameras)
         if self.root is not None:
             require_root("root", self.root.tensor(), lenses + 6 * len(self.names) + 1)

@@ -495,7 +495,7 @@ def camera_verdict(
         >>> result = calibrate_camera(Observations(board=board, image_size=(640, 480), views=views))
         >>> verdict = camera_verdict(result, requirements=Requirement.parse("50m:10%"))
         >>> verdict.usable, [finding.name for finding in verdict.findings if finding.severity == "doubt"]
-        (True, ['depth', 'coverage', 'views', 'halves', 'roll'])
+        (True, ['depth', 'coverage', 'views', 'patterns', 'halves', 'motion', 'roll'])
     """
     options = options or CalibrationOptions()
     examination = examination or examine(result, options, progress)

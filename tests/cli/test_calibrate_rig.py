@@ -247,7 +247,7 @@ class TestRig:
         assert file.calibration.pairs == 6
         assert float(file.rig().baseline) == pytest.approx(float(RIG.baseline), abs=0.001)
         assert file.mounting is None
-        assert file.known() is not None
+        assert file.rig().covariance is not None
 
     @pytest.mark.slow
     @pytest.mark.parametrize(("shift", "keep_all"), [(1.5, False), (40.0, True)])

@@ -27,8 +27,6 @@ from typing import Any
 import rich.progress
 from waiting import wait_for
 
-from scripts.shared.children import children
-
 
 def interrupt_at(moment: str) -> None:
     """Send SIGINT, or SIGKILL, to all processes of this command at that moment."""
@@ -107,6 +105,8 @@ def interrupt(folder: Path, moment: str, line: str) -> str:
         done = subprocess.run(words, cwd=folder, capture_output=True, text=True, start_new_session=True, timeout=1800)
         code, said = done.returncode, done.stderr
     else:
+        from scripts.shared.children import children  # which this file as a script would not find
+
         with tempfile.TemporaryDirectory() as place:
             there = Path(place, "said")
             child = children().Process(target=_command, args=(moment, words, folder, there, dict(os.environ)))

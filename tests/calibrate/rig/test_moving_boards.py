@@ -141,7 +141,7 @@ def test_what_is_told_of_motions_is_that_of_all_rows(shared: int) -> None:
     assert rig.variance == pytest.approx(float(off[:, -1].square().sum()) / counts)
     # Up to a constant: at several ratios of motions to the noise, and at two levels of that.
     places = [np.array([0.0, a, b, a, b, noise]) for a, b, noise in ((-9, -9, 0), (-1, 0, 0), (1, -2, 0), (0, 1, 0.3))]
-    dense, told = (loss.values(np.stack(places)) for loss in losses)
+    dense, told = ([loss.value(place) for place in places] for loss in losses)
     np.testing.assert_allclose(np.subtract(told, told[0]), np.subtract(dense, dense[0]), rtol=1e-4, atol=1e-3)
 
 
