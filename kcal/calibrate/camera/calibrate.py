@@ -20,6 +20,7 @@ from kcal.calibrate.camera.hybrid import (
 )
 from kcal.calibrate.camera.one_camera import lenses_by_view
 from kcal.calibrate.camera.result import (
+    COPY,
     CalibrationOptions,
     CameraCalibrationResult,
     Progress,
@@ -234,7 +235,7 @@ def _complete(
     names = observations.names
     more = (*copy_findings(names, copied), *pose_findings(result.observations.pixels()), *unit_findings(result))
     residuals = dict(zip((i for i in range(len(names)) if i not in copied), result.per_view_rms.tolist(), strict=True))
-    without = {i: (f"it is a copy of {names[first]}", residuals[first]) for i, first in copied.items()}
+    without = {i: (f"{COPY} {names[first]}", residuals[first]) for i, first in copied.items()}
     return among_all(dataclasses.replace(result, findings=(*result.findings, *more)), observations, without)
 
 

@@ -235,6 +235,9 @@ class CalibrationOptions:
 
 # What the calibration of one camera returns.
 
+# Why a view is left out without being asked: the words with which the reason begins.
+COPY = "it is a copy of"
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Rejected:

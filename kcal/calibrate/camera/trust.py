@@ -14,7 +14,7 @@ from torch import Tensor
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.hybrid import corner_weights
-from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
+from kcal.calibrate.camera.result import COPY, CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
 from kcal.calibrate.camera.solve import calibrate_parametric
 from kcal.calibrate.camera.warnings import board_distances, corner_pupil, distance_text
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
@@ -208,7 +208,8 @@ def stored_options(camera: Camera) -> CalibrationOptions:
         'opencv4'
     """
     record = camera.calibration.record if camera.calibration else None
-    reject = OutlierRejection() if record and record.excluded else None
+    asked = record is not None and any(not one.reason.startswith(COPY) for one in record.excluded)
+    reject = OutlierRejection() if asked else None
     if camera.model.hybrid is None:
         warp = record is not None and record.board_warp is not None
         return CalibrationOptions(model=camera.model, board_warp=warp, reject=reject)

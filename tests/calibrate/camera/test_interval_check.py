@@ -12,12 +12,14 @@ import pytest
 import torch
 
 import kcal.calibrate.camera.trust as module
-from kcal import Camera, Observations, calibrate_camera
+from kcal import Camera, Observations, calibrate_camera, load_camera
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult
 from kcal.calibrate.camera.trust import interval_check, simulated_refits
 from kcal.cli.main import main
+from kcal.cli.report import calibrated_again
 from kcal.finding import Finding
 from kcal.lens import CameraCalibration
+from kcal.lens.calibration import Exclusion
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.report.judge_camera import fault_of_views
 from scripts.shared.views import observed, simulate
@@ -30,6 +32,35 @@ AT = [math.inf]
 def capture(seed: int, noise: float = 0.2) -> Observations:
     truth = Camera.build(focal=(1600, 1600), center=(963, 536), size=(1920, 1080), coefficients=[-0.25, 0.08])
     return observed(simulate(6, truth, seed=seed, noise=noise)["pixels"].tolist())
+
+
+def test_copies_are_left_out_without_being_asked() -> None:
+    """A camera whose file names a copy was not calibrated with --reject, and is not calibrated again with it."""
+    seen = capture(1)
+    twice = seen.model_copy(update={"views": (*seen.views, seen.views[0].model_copy(update={"name": "copy.png"}))})
+    camera = calibrate_camera(twice, OPTIONS).camera
+    assert camera.calibration is not None
+    record = camera.calibration.record
+    assert record is not None
+    assert [one.reason for one in record.excluded] == [f"it is a copy of {seen.views[0].name}"]
+    assert module.stored_options(camera).reject is None
+    gone = dataclasses.replace(record, excluded=(Exclusion(name="a corner 3", reason="3 px off"), *record.excluded))
+    camera.calibration = dataclasses.replace(camera.calibration, record=gone)
+    assert module.stored_options(camera).reject is not None
+
+
+@pytest.mark.slow
+def test_a_camera_calibrated_without_motion_is_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four views would be allowed the motion of a hand: the file does not say that they were not."""
+    # With motion these views give nearly the same camera, by a fifth of its error bars.
+    monkeypatch.setattr("kcal.report.judge_camera._ITSELF", 0.01)
+    seen = capture(1).subset([view.name for view in capture(1).views[:4]])
+    still = CalibrationOptions(motion=False)
+    path = calibrate_camera(seen, still).save(tmp_path / "a.camera.json")
+    seen.save(tmp_path / "a.obs.json")
+    found, options = calibrated_again(load_camera(path), tmp_path / "a.obs.json", "calibrating")
+    assert options == still
+    assert torch.equal(found.camera.params, load_camera(path).params)
 
 
 @pytest.fixture(scope="module")
