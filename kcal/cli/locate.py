@@ -153,7 +153,7 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[rooms.Point
         whole = localize(solved)
         if own.history is not None:
             # Moments add what is not known of them.
-            whole.included = ("marks", "calibration", "mounting")
+            whole.included = ("marks", "calibration", *(("mounting",) if whole.origin else ()))
             by_moments = rooms.located_at(
                 own.history, solved, lambda rig: rooms.PointLocator(localize(rig), geoid=geoid)
             )

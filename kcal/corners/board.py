@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -127,17 +127,17 @@ def target_fields(path: str | Path) -> dict[str, Any]:
         raise FileError(f"{path}: not a target file of Kalibr: target_type is missing")
     kind = content["target_type"]
 
-    def stated(name: str, what: str, kinds: Any, low: float, high: float) -> Any:
+    def stated(name: str, what: str, kinds: Any, fits: Callable[[Any], bool]) -> Any:
         value: Any = content.get(name)
-        if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
+        if isinstance(value, bool) or not isinstance(value, kinds) or not fits(value):
             raise FileError(f"{path}: {name} must be {what}, it is {value!r:.40}")
         return value
 
     def number(name: str) -> float:
-        return float(stated(name, "a positive number", (int, float), 1e-300, 1e3))
+        return float(stated(name, "a positive number", (int, float), lambda value: 0 < value < 1e3))
 
     def count(name: str) -> int:
-        return int(stated(name, "a whole number from 1 to 500", int, 1, 500))
+        return int(stated(name, "a whole number from 1 to 500", int, lambda value: 1 <= value <= 500))
 
     if kind == "aprilgrid":
         size, columns, rows = number("tagSize"), 2 * count("tagCols"), 2 * count("tagRows")

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kcal.corners.board import Board
+from kcal.corners.grid import direct_equations
 from kcal.corners.images import Gray
 from kcal.corners.saddle import CornerStatus, Refined, with_status
 from kcal.corners.search import NotFoundError, in_new_thread, search_sizes, to_full_size
@@ -288,16 +289,7 @@ def homography(points: Tensor, pixels: Tensor) -> Tensor:
     """(3, 3) image from board of points (N, 2), by linear least squares in normalized coordinates (R. Hartley)."""
     from_points, a = _normalized(points)
     from_pixels, b = _normalized(pixels)
-    x, y = a.unbind(-1)
-    u, v = b.unbind(-1)
-    one, zero = torch.ones_like(x), torch.zeros_like(x)
-    rows = torch.cat(
-        [
-            torch.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], -1),
-            torch.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], -1),
-        ]
-    )
-    h = torch.linalg.svd(rows)[2][-1].reshape(3, 3)
+    h = torch.linalg.svd(direct_equations(a, b))[2][-1].reshape(3, 3)
     found = torch.linalg.solve(from_pixels, h @ from_points)
     return found / found[2, 2]
 

@@ -111,6 +111,16 @@ def _alternating(levels: Tensor) -> Tensor:
     return torch.cat([across.reshape(-1), down.reshape(-1)])
 
 
+def direct_equations(points: Tensor, image: Tensor, seen: Tensor | None = None) -> Tensor:
+    """(..., 2 N, 9) equations of the direct linear transform from points to image (..., N, 2); zero where not seen."""
+    at = torch.nn.functional.pad(points, (0, 1), value=1.0)
+    if seen is not None:
+        at = at * seen[..., None]
+    zero = torch.zeros_like(at)
+    rows = [torch.cat([at, zero, -image[..., :1] * at], -1), torch.cat([zero, at, -image[..., 1:] * at], -1)]
+    return torch.cat(rows, -2)
+
+
 def checkered(grid: Tensor) -> Tensor:
     """1 and -1 in turn, for the places of a grid (rows, columns, ...)."""
     i, j = torch.meshgrid(*map(torch.arange, grid.shape[:2]), indexing="ij")
@@ -454,13 +464,9 @@ def _bend(grid: Tensor) -> Tensor:
     u, v = ((flat - center) / side[:, None, None]).unbind(-1)
     y, x = torch.meshgrid(torch.arange(high).double() - 1, torch.arange(wide).double() - 1, indexing="ij")
     x, y = x.reshape(1, -1).expand_as(u), y.reshape(1, -1).expand_as(u)
-    one, zero = torch.ones_like(u), torch.zeros_like(u)
-    # The linear homography equations, with the last element fixed: its plane at infinity never crosses a block.
-    first = torch.stack([x, y, one, zero, zero, zero, -u * x, -u * y], -1)
-    second = torch.stack([zero, zero, zero, x, y, one, -v * x, -v * y], -1)
-    solution = torch.linalg.lstsq(
-        torch.cat([first, second], 1), torch.cat([u, v], 1)[..., None], driver="gelsd"
-    ).solution[..., 0]
+    # With the last element fixed: its plane at infinity never crosses a block.
+    equations = direct_equations(torch.stack([x, y], -1), torch.stack([u, v], -1))
+    solution = torch.linalg.lstsq(equations[..., :8], -equations[..., 8:], driver="gelsd").solution[..., 0]
     a = solution[:, None]
     w = a[..., 6] * x + a[..., 7] * y + 1
     miss = torch.hypot(

@@ -17,10 +17,7 @@ from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.pose import Movable, rotation_from_vector
-from kcal.lens.rig import (
-    Origin,
-    Rig,
-)
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, mean_radius, place_enu
 from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric

@@ -15,7 +15,7 @@ from unittest import mock
 import torch
 from torch import Tensor
 
-from kcal import Baseline, Board, Camera, Localizer, Observations, Rig, RigData, View, solve_rig
+from kcal import Board, Camera, Localizer, Observations, Rig, RigData, View, solve_rig
 from kcal.calibrate.rig import assess
 from kcal.calibrate.rig.contradictions import widen_for_parts
 from kcal.calibrate.rig.pairs import paired_boards
@@ -35,11 +35,12 @@ from scripts.check.rig import (
     normal,
     seen,
     spread,
+    tape,
 )
 from scripts.shared.page import table
 from scripts.shared.sections import section
 
-FIELD, TAPE, RANGE = 0.1, 0.005, 1000.0
+FIELD, RANGE = 0.1, 1000.0
 CLOSE = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
 NEAR = Rig.pair(CLOSE, CLOSE, torch.eye(3), torch.tensor([-0.2, 0.0, 0.0]))
 
@@ -66,9 +67,8 @@ def surveyed(kind: str, seed: int) -> RigData:
     if "bias" in kind:
         pixels[:, 1] += lenses[1](pixels[:, 1])
     matches = matches_of(pixels)
-    tape = Baseline(first=0, second=1, length=BASELINE + TAPE * float(normal((1,), draw)), sigma=TAPE)
     return RigData(cameras=(TRUTH.left, TRUTH.right), names=NAMES, landmarks=marked,
-                   features=None if "30" in kind else matches, baselines=(tape,))  # fmt: skip
+                   features=None if "30" in kind else matches, baselines=(tape(draw),))  # fmt: skip
 
 
 def boards(kind: str, seed: int) -> RigData:

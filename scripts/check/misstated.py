@@ -13,11 +13,10 @@ from collections.abc import Iterator
 
 import torch
 
-from kcal import Baseline, InputError, RigData, solve_rig
+from kcal import InputError, RigData, solve_rig
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens import vector_from_rotation
 from scripts.check.rig import (
-    BASELINE,
     MARK,
     NAMES,
     ROTATION,
@@ -29,28 +28,29 @@ from scripts.check.rig import (
     normal,
     seen,
     spread,
+    tape,
 )
 from scripts.shared.page import table
 from scripts.shared.sections import section
 from scripts.shared.timing import rms
 
-MATCHES, TAPE = 300, 0.005
+MATCHES = 300
 
 
-def data(times: float, tape: float, seed: int) -> RigData:
+def data(times: float, length: float, seed: int) -> RigData:
     """The sources of one rig: marks worse by a factor, a tape that is wrong by another."""
     draw = generator(seed)
     marked = landmarks(draw)
     points = spread(MATCHES, 300.0, 8000.0, draw)
     matches = matches_of(seen(points) + MARK * normal((MATCHES, 2, 2), draw))
-    length = BASELINE * tape + TAPE * float(normal((1,), draw))
+    measured = tape(draw, length)
     worse = marked.pixels + math.sqrt(times**2 - 1.0) * MARK * normal((len(marked.names), 2, 2), draw)
     return RigData(
         cameras=(TRUTH.left, TRUTH.right),
         names=NAMES,
         landmarks=dataclasses.replace(marked, pixels=worse),
         features=matches,
-        baselines=(Baseline(first=0, second=1, length=length, sigma=TAPE),),
+        baselines=(measured,),
     )
 
 

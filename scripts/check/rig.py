@@ -31,7 +31,7 @@ TRUTH = rig()
 LOOK = enu_from_cam(HEADING).T
 ROTATION = torch.stack([LOOK, TRUTH.right_from_left_rotation @ LOOK])
 CENTER = torch.stack([torch.zeros(3).double(), -TRUTH.right_from_left_translation @ ROTATION[1]])
-BASELINE = float(TRUTH.baseline)
+BASELINE, TAPE = float(TRUTH.baseline), 0.005
 NAMES = ("left", "right")
 # The simulated light goes straight.
 STRAIGHT = RigOptions(refraction=0.0, refraction_sigma=0.0)
@@ -96,6 +96,12 @@ def matches_of(pixels: Tensor, sigma: float = MARK) -> Features:
     )  # fmt: skip
 
 
+def tape(draw: torch.Generator, times: float = 1.0) -> Baseline:
+    """The baseline, measured by a tape that is right, or wrong by a factor."""
+    length = BASELINE * times + TAPE * float(normal((1,), draw))
+    return Baseline(first=0, second=1, length=length, sigma=TAPE)
+
+
 def data(kind: str, draw: torch.Generator) -> RigData:
     """A survey with more or less besides."""
     marks = landmarks(draw)
@@ -103,8 +109,7 @@ def data(kind: str, draw: torch.Generator) -> RigData:
     positions: tuple[MeasuredPosition, ...] = ()
     features = None
     if "baseline" in kind:
-        length = BASELINE + 0.005 * float(normal((1,), draw))
-        baselines = (Baseline(first=0, second=1, length=length, sigma=0.005),)
+        baselines = (tape(draw),)
     if "positions" in kind:
         sigma = torch.tensor([0.02, 0.02, 0.04], dtype=torch.float64)
         positions = tuple(

@@ -104,6 +104,17 @@ def marks(folder: Path, times: list[str]) -> Path:
     return path
 
 
+def test_a_rig_without_a_place_has_no_errors_of_its_place(watched: Path, command: Command) -> None:
+    rig = load_rig(watched / "rig.json")
+    rig.mounting = None
+    save_rig(rig, watched / "lab.json")
+    words = ["locate", watched / "lab.json", marks(watched, [f"{START + 1800.5}"]), "--pixel-sigma", "0.02"]
+    found = command(*words, "--history", watched / "h.csv", "-o", watched / "lab.csv")
+    said = " ".join((found.out + found.err).split())
+    assert "of the errors in calibration" in said
+    assert "calibration and mounting" not in said
+
+
 def test_rows_are_located_by_the_rig_of_their_time(watched: Path, command: Command) -> None:
     points = marks(watched, [f"{START + 1800.5}", "2026-05-01T12:30:00Z", f"{START + 36_000}"])
     words = ["locate", str(watched / "rig.json"), str(points), "--pixel-sigma", "0.02", "-o", str(watched / "out.csv")]

@@ -13,6 +13,7 @@ from torch import Tensor
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior, ParameterConstraints, Term
 from kcal.calibrate.problem.state import BoardState
+from kcal.corners.grid import direct_equations
 from kcal.gaussian import Covariance, triangular
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
@@ -40,7 +41,7 @@ def homographies(board_points: Tensor, pixels: Tensor) -> Tensor:
     seen = torch.isfinite(pixels).all(-1)
     board, board_scale = _centered(board_points[None, :, :2], seen)
     image, image_scale = _centered(pixels.nan_to_num(0.0), seen)
-    equations = _direct_equations(board, image, seen)
+    equations = direct_equations(board, image, seen)
     _, vectors = torch.linalg.eigh(equations.mT @ equations)
     normalized = vectors[..., 0].unflatten(-1, (3, 3))
     found: Tensor = torch.linalg.solve(image_scale, normalized @ board_scale)
@@ -62,15 +63,6 @@ def _centered(points: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
     return (points - middle) * scale[..., None], to
 
 
-def _direct_equations(board: Tensor, image: Tensor, seen: Tensor) -> Tensor:
-    """(V, 2 N, 9) equations of the direct linear transform from points (V, N, 2); zero where none is seen (V, N)."""
-    weight = seen.to(image.dtype)[..., None]
-    at = torch.nn.functional.pad(board, (0, 1), value=1.0) * weight
-    zero = torch.zeros_like(at)
-    rows = [torch.cat([at, zero, -image[..., :1] * at], -1), torch.cat([zero, at, -image[..., 1:] * at], -1)]
-    return torch.cat(rows, -2)
-
-
 def spread_out(board_points: Tensor, pixels: Tensor) -> Tensor:
     """Whether the corners seen in each view determine a homography: not all, nor all but one, on one line.
 
@@ -85,7 +77,7 @@ def spread_out(board_points: Tensor, pixels: Tensor) -> Tensor:
     """
     low, high = board_points[:, :2].amin(0), board_points[:, :2].amax(0)
     board = ((2.0 * board_points[:, :2] - low - high) / (high - low))[None]
-    values = torch.linalg.svdvals(_direct_equations(board, board, torch.isfinite(pixels).all(-1)))
+    values = torch.linalg.svdvals(direct_equations(board, board, torch.isfinite(pixels).all(-1)))
     return values[..., 7] > 1e-9 * values[..., 0]
 
 
