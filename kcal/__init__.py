@@ -9,6 +9,6 @@ from __future__ import annotations
 
 from kcal.doors import door
 
-__version__ = "1.0.0"
+__version__ = "2.0.0"
 
 __getattr__, __dir__ = door(__name__, __file__)

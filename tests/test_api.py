@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import importlib.metadata
 import inspect
 import subprocess
 import sys
@@ -212,7 +211,13 @@ def test_unknown_names() -> None:
 
 
 def test_version() -> None:
-    assert importlib.metadata.version("kcal") == kcal.__version__
+    """One version in the package, the project, the citation and the newest entry of the changelog."""
+    root = Path(__file__).parents[1]
+    names = "pyproject.toml", "CITATION.cff", "CHANGELOG.md"
+    project, citation, changes = ((root / name).read_text(encoding="utf-8") for name in names)
+    assert tomllib.loads(project)["project"]["version"] == kcal.__version__
+    assert f"\nversion: {kcal.__version__}\n" in citation
+    assert changes.split("\n## [")[2].startswith(f"{kcal.__version__}] - ")
 
 
 @pytest.mark.parametrize("module", [*PUBLIC, "kcal.cli.main"])
