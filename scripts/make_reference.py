@@ -3,7 +3,8 @@
     python -m scripts.make_reference
 
 Names, their groups and the modules that define them come from the stubs (`kcal/__init__.pyi`, `kcal/lens/__init__.pyi`
-and so on), what each is from the first line of its docstring. Nothing of kcal is imported.
+and so on), its kind from its base classes, what it does from the first line of its docstring. Nothing of kcal is
+imported.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ INSIDE = {
     "GroundSurface", "HistoryRow", "HybridFit", "LearnedStart", "LensPrior", "PosedCameras", "Spline",
     "Surroundings", "TurnModel", "WeightPrior",
 }  # fmt: skip
+_BASES = {"nn.Module": "module", "Exception": "error", "UserWarning": "warning"}
 
 
 def groups(door: str) -> dict[str, list[tuple[str, str]]]:
@@ -71,13 +73,8 @@ def returned_by() -> dict[str, list[tuple[str, str]]]:
 
 def _returns(module: str, name: str) -> set[tuple[str, str]]:
     """Classes of kcal (name, module) that a function, or a class in its methods and fields, gives away."""
-    tree = _tree(module)
-    imported = {
-        alias.asname or alias.name: (alias.name, str(node.module))
-        for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names
-    }  # fmt: skip
-    imported |= {node.name: (node.name, module) for node in tree.body if isinstance(node, ast.ClassDef)}
-    (found,) = (node for node in tree.body if getattr(node, "name", None) == name)
+    imported = _imported(module)
+    found = _defined(module, name)
     members = found.body if isinstance(found, ast.ClassDef) else [found]
     given = [
         part
@@ -96,6 +93,34 @@ def _returns(module: str, name: str) -> set[tuple[str, str]]:
         if not home.startswith(("kcal.calibrate.problem.", "kcal.calibrate.rig.source"))
         if any(isinstance(node, ast.ClassDef) and node.name == kind for node in _tree(home).body)
     }
+
+
+def kind_of(module: str, name: str) -> str:
+    """What a name is: a function, a `torch.nn.Module`, an error, a warning or another type."""
+    found = _defined(module, name)
+    if not isinstance(found, ast.ClassDef):
+        return "function"
+    for base in (ast.unparse(base).partition("[")[0] for base in found.bases):
+        own, home = _imported(module).get(base, (base, ""))
+        kind = kind_of(home, own) if home.startswith("kcal") else _BASES.get(base, "type")
+        if kind != "type":
+            return kind
+    return "type"
+
+
+def _imported(module: str) -> dict[str, tuple[str, str]]:
+    """What a module's names of imports and classes mean: (name, the module that defines it)."""
+    tree = _tree(module)
+    names = {
+        alias.asname or alias.name: (alias.name, str(node.module))
+        for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names
+    }  # fmt: skip
+    return names | {node.name: (node.name, module) for node in tree.body if isinstance(node, ast.ClassDef)}
+
+
+def _defined(module: str, name: str) -> ast.stmt:
+    (found,) = (node for node in _tree(module).body if getattr(node, "name", None) == name)
+    return found
 
 
 def _own(node: ast.AnnAssign | ast.FunctionDef) -> str:
@@ -145,10 +170,11 @@ def page(door: str) -> str:
         lines += ["", f"## {title}", ""]
         if title == RETURNED:
             lines += ["What the names above return and contain. To annotate with one, import it from its module.", ""]
-        lines += ["| Name | What it is |", "|---|---|"]
+        lines += ["| Name | Kind | What it is or does |", "|---|---|---|"]
         for name, module in names:
             where = f" of `{module}`" if title == RETURNED else ""
-            lines += [f"| `{name}`{where} | {first_line(module, name).replace('|', chr(92) + '|')} |"]
+            kind = kind_of(module, name)
+            lines += [f"| `{name}`{where} | {kind} | {first_line(module, name).replace('|', chr(92) + '|')} |"]
     return "\n".join(lines) + "\n"
 
 

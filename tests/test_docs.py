@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from kcal.cli.options import NAME as SETTINGS_FILE
 from scripts.docs_site import commands_page, navigation, ordered, with_descriptions
@@ -146,6 +147,11 @@ def test_every_public_name_is_in_the_reference(door: str) -> None:
     for name, home in homes.items():
         assert f"| [`{name}`][{home}.{name}] {'|' if name in listed else 'of'}" in site
         assert f"::: {home}.{name}\n" in site
+        value = getattr(importlib.import_module(home), name)
+        kinds = ((torch.nn.Module, "module"), (Warning, "warning"), (Exception, "error"), (object, "type"))
+        kind = next(kind for base, kind in kinds if issubclass(value, base)) if isinstance(value, type) else "function"
+        where = "" if name in listed else f" of `{home}`"
+        assert f"| `{name}`{where} | {kind} | " in text
 
 
 def test_the_pages_of_the_reference_are_on_the_index() -> None:
