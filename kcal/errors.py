@@ -25,7 +25,7 @@ class DegenerateError(KcalError):
 
 
 class KcalWarning(UserWarning):
-    """Input that can be right and is more likely a slip: meters for millimeters, width for height, right for left."""
+    """Input that is probably a mistake: meters for millimeters, width for height, right for left."""
 
 
 def warn_user(message: str) -> None:

@@ -46,7 +46,7 @@ KINDS = {
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Something that was found about a calibration.
+    """A doubt about a calibration, or a note.
 
     Args:
         name: short and fixed, for programs: "model", "pupil", "board", "tilt", "coverage", ...

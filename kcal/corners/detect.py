@@ -69,7 +69,7 @@ _STATUS_TEXTS = {
 
 @briefly
 class Detection(NamedTuple):
-    """What was found of a board in an image.
+    """Result of `detect_board`.
 
     Args:
         pixels: (corners, 2) float64 in the board's order, NaN where not seen; None if no board was found.

@@ -159,7 +159,7 @@ read_gtsam = read_ceres = read_numpy = read_prior
 
 
 def ceres_prior(path: str | Path, camera: Any, *, pixel_sigma: float, number: int = 0) -> Any:
-    """A residual block of pyceres that holds a camera of COLMAP where `kcal export` has it, as firmly as it is known.
+    """A residual block of pyceres: the exported prior of a camera of COLMAP.
 
     Args:
         path: what `kcal export --format colmap` wrote beside the cameras, NAME.prior.json.

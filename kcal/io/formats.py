@@ -269,7 +269,7 @@ def import_cameras(
     fisheye: bool | None = None,
     meters: float | None = None,
 ) -> ImportedCameras:
-    """Read cameras, and how they stand to each other, from files of other programs or of kcal.
+    """Read cameras, and their relative poses, from files of other programs or of kcal.
 
     OpenCV (YAML, XML; fisheye and omnidir, too), ROS camera_info and bags with it, Kalibr camchains and results,
     Basalt, mrcal, COLMAP with its rigs and databases, nerfstudio, MATLAB structs, OpenSfM, TOML of aniposelib, pose2sim

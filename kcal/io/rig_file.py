@@ -322,7 +322,7 @@ def rig_to_file(rig: Rig) -> RigFile:
 
 
 def save_rig(rig: Rig, path: str | Path) -> Path:
-    """Write a rig with its cameras and all that is known of them: covariances, mounting and how they were calibrated.
+    """Write a rig with its cameras, covariances, mounting, and how they were calibrated.
 
     Raises:
         InputError: see `rig_to_file`.
@@ -341,7 +341,7 @@ def save_rig(rig: Rig, path: str | Path) -> Path:
 
 
 def load_rig(path: str | Path, *, field: nn.Module | None = None) -> Rig:
-    """Read the rig of a kcal rig file, with all that is known of it and of its cameras.
+    """Read the rig of a kcal rig file, with the error bars and the history of it and its cameras.
 
     `field` as for `kcal.load_camera`, for all cameras: each gets a copy with its own weights.
 

@@ -147,7 +147,7 @@ class CalibrationRecord:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LensSetting:
-    """Where zoom and focus of a lens stood, as numbers of any unit: steps of a motor, a scale, millimeters.
+    """Zoom and focus of a lens, as numbers of any unit: steps of a motor, a scale, millimeters.
 
     Args:
         values: name -> number, for example `{"focus": 3.2}`.

@@ -113,7 +113,7 @@ def camera_difference(
     rotation: Tensor | None = None,
     grid: tuple[int, int] = (33, 25),
 ) -> CameraDifference:
-    """Compare what two cameras see, after the turn of the second that fits best.
+    """Compare what two cameras see, after the best-fit rotation of the second.
 
     The turn minimizes the squared shifts over a grid of the image, weighted by the inverse variances of both cameras
     where their calibration has them, else equally. For points at a distance the second camera may also stand elsewhere.

@@ -22,7 +22,7 @@ _MOST = 1e100
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class CameraInformation:
-    """What the data of one camera say, and what was assumed beforehand; together they are largest at the estimate.
+    """The likelihood of one camera's data and its priors; their product is largest at the estimate.
 
     Convention: the unknowns x (U,) are parameters of the camera, then amplitudes of the modes of its board, if it has
     any. Near the estimate, the data's likelihood is exp(-½ ‖rows (x - estimate) + residuals‖²), and the prior is

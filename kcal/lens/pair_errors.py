@@ -16,7 +16,7 @@ from kcal.texts import brief
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RigCovariance:
-    """How well a rig is known: one joint covariance, so that what is correlated stays so.
+    """The joint covariance of a rig's lenses and relative pose.
 
     The order is: the parameters of the left camera as in `Camera.names`, those of the right one, the rotation of
     right_from_left (3 radians: a rotation vector about the right camera's axes, `exp([ω]x) R`), its translation

@@ -109,7 +109,7 @@ def check_refraction(refraction: float, sigma: float) -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Mounting:
-    """How a camera stands, how light is refracted there, and how well both are known.
+    """Position and attitude of a camera on the Earth, refraction there, and the covariance of both.
 
     Args:
         origin: place of the camera's projection center.

@@ -443,7 +443,7 @@ class Cause(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class RangeCheck:
-    """What `check_ranges` found of N points.
+    """Result of `check_ranges` for N points.
 
     Args:
         names: of the points.
@@ -492,7 +492,7 @@ class RangeCheck:
 def check_ranges(
     rig: Rig, marks: Marks, ranges: Tensor, sigmas: Tensor, *, pixel_sigma: float = 0.3, level: float = 0.05
 ) -> RangeCheck:
-    """Compare ranges by a rig with known ones, jointly, and tell whether yaw, scale or noise explains what is off.
+    """Compare a rig's ranges with known ones, jointly, and say whether yaw, scale or noise explains the errors.
 
     All points share the errors of the rig: with a yaw that is off by two sigma all ranges are, and one by one none of
     them tells more than another. So errors of one over the range, which are Gaussian, are compared with their full

@@ -80,7 +80,7 @@ def mounting_of(
 
 @in_one_thread
 def placed_rig(result: RigResult, origin: Origin) -> Rig:
-    """The rig of a result with everything that is known of it: also its mounting, if the data determine it.
+    """The rig of a result with its errors, and its mounting if the data determine it.
 
     Args:
         result: from `kcal.solve_rig`; its first camera is the left one.
@@ -116,7 +116,7 @@ def placed_rig(result: RigResult, origin: Origin) -> Rig:
 def mounting_covariance(
     *, origin_m: Sequence[float] = (0.0, 0.0, 0.0), attitude_deg: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> Tensor:
-    """(6, 6) covariance of how a rig stands: east, north, up of its origin, and small turns about these axes.
+    """(6, 6) covariance of a mounting: east, north, up of its origin, and small turns about these axes.
 
     Args:
         origin_m: one sigma of the left camera's position, meters east, north, up.

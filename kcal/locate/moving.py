@@ -62,7 +62,7 @@ class Fixes(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class MovingTrack:
-    """What a receiver tells of one target that moves.
+    """Reported positions of one moving target.
 
     Args:
         name: of the target.
@@ -333,7 +333,7 @@ _SAME = 1e-3
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MovingOptions:
-    """What is known beforehand of clocks and marks.
+    """Standard deviations of clocks and marks.
 
     Args:
         clock_sigma: seconds, of the cameras' clocks against that of the tracks; searched within three of it.
@@ -351,7 +351,7 @@ class MovingOptions:
 
 
 class Identity(NamedTuple):
-    """What a sighting turned out to be.
+    """The track that a sighting was assigned to, or why there is none.
 
     Attributes:
         camera: number of the camera.

@@ -144,7 +144,7 @@ _HEADINGS = 36
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Site:
-    """A place where a camera stands, or could stand.
+    """An existing or possible place of a camera.
 
     Args:
         name: of the site.
@@ -253,7 +253,7 @@ class SitingMap(NamedTuple):
 
 @briefly
 class RankedSite(NamedTuple):
-    """A candidate, and what it would give.
+    """A candidate with its rank and the errors that would remain.
 
     Attributes:
         site: with the heading that is best.
@@ -364,7 +364,7 @@ def rank_sites(
     area: Area, sites: Sequence[Site], candidates: Sequence[Site], *, build: int | None = None,
     weights: Tensor | None = None,
 ) -> list[RankedSite]:  # fmt: skip
-    """Order candidates by what they give together with the sites that stand: greedily, the best one first.
+    """Rank candidates by what each adds to the existing sites, greedily, the best one first.
 
     Args:
         area: from `area_of`, with sites and candidates.

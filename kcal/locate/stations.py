@@ -62,7 +62,7 @@ def stated_mounting(
     roll_deg: tuple[float, float] = (0.0, 0.0),
     sigma_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Mounting:
-    """How a camera stands, of which position and angles were measured, each with its standard deviation.
+    """The mounting of a camera from measured position and angles, each with its standard deviation.
 
     Args:
         origin: its place.
@@ -146,7 +146,7 @@ def station_rig(
     refraction: float = REFRACTION,
     refraction_sigma: float = REFRACTION_SIGMA,
 ) -> Rig:
-    """The rig of cameras of which it is known how each stands: the inverse of `station_mounting`.
+    """The rig of cameras whose mountings are known: the inverse of `station_mounting`.
 
     North and up are those at each camera: 60 km apart they differ by half a degree, which is 500 m at that distance.
     Errors of the cameras' poses are independent of each other. Errors of one lens at several places are the same at

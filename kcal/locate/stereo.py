@@ -72,7 +72,7 @@ _PARALLEL = 1e-9
 
 
 class PositionStatus(enum.IntEnum):
-    """What became of a pixel pair. Only `OK` comes with a point; `PARALLEL` still has a bearing and a nearest range.
+    """Status of a located pixel pair. Only `OK` has a point; `PARALLEL` still has a bearing and a nearest range.
 
     CONTRADICTION, where all errors weigh: the views are not of one point, and which is wrong cannot be told.
     """

@@ -160,7 +160,7 @@ def place_sigma(row: TableRow, what: str) -> tuple[float, float, float]:
 
 @briefly
 class MarkedLandmarks(NamedTuple):
-    """Landmarks with their marks, and what has only one of the two."""
+    """Landmarks with their marks, and names that have only one of the two."""
 
     landmarks: Landmarks
     unmarked: tuple[str, ...]

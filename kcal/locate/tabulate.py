@@ -40,7 +40,7 @@ class Geoid(NamedTuple):
 
 
 def find_geoid(path: str | Path | None = None) -> Geoid | None:
-    """The geoid grid to use: the file given, or one that PROJ finds on this machine, or None; nothing is downloaded.
+    """The geoid grid of a file, or one that PROJ finds on this machine, or None; nothing is downloaded.
 
     Args:
         path: a grid that PROJ reads (.tif, .gtx, .byn), for example `us_nga_egm08_25.tif` from cdn.proj.org.
@@ -345,7 +345,7 @@ def _standard_normal(device: torch.device) -> Tensor:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Viewpoint:
-    """Where a camera of the rig stands and what it sees, for maps.
+    """Position and field of view of a camera of the rig, for maps.
 
     Args:
         name: "left" or "right", or that of a station.

@@ -88,7 +88,7 @@ class PosedCameras(NamedTuple):
 
 @briefly
 class CommonErrors(NamedTuple):
-    """What all marks of a camera have in common: K independent errors.
+    """Errors that all marks of a camera share: K independent ones.
 
     Attributes:
         lens: for each camera the numbers of its parameters that are not exact.

@@ -213,7 +213,7 @@ Anchor = Literal["center", "bottom"] | int
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Detections:
-    """What a detector found in one image.
+    """A detector's boxes in one image.
 
     Convention: pixel (0, 0) is the center of the first pixel, as everywhere in kcal. Detectors mostly count from the
     first pixel's upper left *edge*; `read` subtracts the half pixel.

@@ -485,7 +485,7 @@ CLOCK_TERMS = 3
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ClockPrior:
-    """What is known of a camera's clock before any target moved, beside the clock of the first camera (the left one).
+    """Prior of a camera's clock relative to that of the first camera (the left one).
 
     Args:
         offset_s: seconds by which its images are later than their times say.
@@ -514,7 +514,7 @@ class ClockPrior:
 
 @briefly
 class ClockEstimate(NamedTuple):
-    """What the tracks say of a camera's clock beside the first one's.
+    """Estimate of a camera's clock relative to the first one's, from the tracks.
 
     Attributes:
         values: (3,) offset (s) at the time of the first frame, drift (s/s), slope (s from top to bottom).

@@ -27,7 +27,7 @@ from kcal.texts import brief, briefly
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectViews:
-    """Objects of one time step, seen by any of V cameras: what a tracker takes in.
+    """Objects of one time step, seen by any of V cameras: the input of a tracker.
 
     Several rows may have the same mark: the tracker then settles whose it is. A row with one camera alone is a bearing:
     it continues a track and begins none.

@@ -121,7 +121,7 @@ def save_view(path: str | Path, rig: Rig | Localizer, *shown: Shown, reach: floa
 
 
 def log_view(recording: Any, rig: Rig | Localizer, *shown: Shown, reach: float | None = None) -> None:
-    """Log a rig to a recording of rerun, and what it saw; a viewer that is connected shows it at once.
+    """Log a rig and what it saw to a recording of rerun; a connected viewer shows it at once.
 
     The scene is east, north, up of the origin of a rig that has a place on the Earth, and the rig's own frame otherwise
     (x right, y down, z forward of the first of two cameras), in meters. Each camera is an entity with its pose, and in

@@ -157,7 +157,7 @@ _UNIT_SIGMA = 1e-3
 
 @briefly
 class ImagePair(NamedTuple):
-    """Two images of one time.
+    """Two images taken at the same time.
 
     Attributes:
         name: of the pair, in messages and of its matches.
@@ -172,7 +172,7 @@ class ImagePair(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PairCounts:
-    """What became of the matches of a pair.
+    """How many matches of a pair were kept and left out.
 
     Args:
         name: of the pair.
@@ -195,7 +195,7 @@ class PairCounts:
 
 @briefly
 class SceneMatches(NamedTuple):
-    """Matches of all pairs as features of unknown range, and what became of the others."""
+    """Matches of all pairs as features of unknown range, and counts of those left out."""
 
     features: Features
     counts: tuple[PairCounts, ...]
@@ -226,7 +226,7 @@ class MatchedPair(NamedTuple):
 
 
 def scene_features(cameras: tuple[Camera, Camera], pairs: Sequence[ImagePair], most: int = MOST) -> SceneMatches:
-    """Find and match what both cameras see, and check it: along epipolar lines, both ways, and in time.
+    """Find and match features of the scene, checked along epipolar lines, both ways, and in time.
 
     Nothing is known of how the cameras stand but what the images tell; lenses are taken as calibrated. Each match has
     the covariance of its least-squares fit, widened by what its error has in common with those of others

@@ -123,7 +123,7 @@ _HIGH = 150.0
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class SkylineAttitude:
-    """How a camera looks, from a skyline.
+    """Attitude of a camera from a skyline.
 
     Args:
         rotation: (3, 3) the camera's axes from east, north, up at the camera.
@@ -414,7 +414,7 @@ def skyline_source(
     *,
     error: RasterError | None = None,
 ) -> tuple[SkylineSource, list[SkylineAttitude]]:
-    """What skylines tell of a rig: the attitude of each camera on the Earth, in one Gaussian for all images.
+    """Attitudes of a rig's cameras on the Earth from skylines, as one Gaussian for all images.
 
     Images of one camera at several times average the noise of the image; the errors of the raster and of refraction
     stay as they are, and are shared by cameras that look at the same terrain.

@@ -1,4 +1,4 @@
-"""Stars of night images: found, named, and what they tell of attitudes, rigs and lenses."""
+"""Stars of night images: detection, names, and the attitudes, rigs and lenses that they determine."""
 
 from kcal.doors import door
 

@@ -44,7 +44,7 @@ _CROWDED, _FAINTER = 6.0, 2.5
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Attitude:
-    """How a camera stands among the stars.
+    """Attitude of a camera relative to the stars.
 
     Args:
         rotation: (3, 3) camera from the frame of the directions.
@@ -279,7 +279,7 @@ class SkyView:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class NamedStars:
-    """The stars of one image, named, and how the camera looks.
+    """The named stars of one image, and the camera's attitude.
 
     Args:
         detected: all stars of the image.

@@ -46,7 +46,7 @@ def star_source(
     origin: Origin | None = None,
     catalog: StarCatalog | None = None,
 ) -> StarSource:
-    """What night images tell of a rig: stars with directions on the Earth, or without.
+    """Stars of night images as a source of a rig, with or without directions on the Earth.
 
     If all images have their attitude on the Earth (`NamedStars.on_earth`), named stars are known in east, north, up,
     and the clock, UT1 and the air's temperature and pressure are unknowns with their sigmas. Otherwise stars only tell

@@ -562,7 +562,7 @@ def _telling(data: RigData) -> Tensor:
 
 
 def check_rig(rig: Rig, *, features: Features | None = None, landmarks: Landmarks | None = None) -> Drift:
-    """Measure how the cameras have turned (`measure_drift`) with what the rig knows of itself.
+    """Measure how the cameras of a rig have turned (`measure_drift`), with the rig's own covariance.
 
     Its mounting gives the left camera's pose for landmarks, and its covariance says how well the attitudes were known.
 

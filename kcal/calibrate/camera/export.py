@@ -45,7 +45,7 @@ _NOISE, _WIDTH = 0.01, 0.3
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class RefittedCamera:
-    """A camera of another model, and how well it stands for the original one.
+    """A camera of another model, and how well it approximates the original one.
 
     Args:
         camera: of the model that was asked for, in the same frame.
@@ -503,7 +503,7 @@ _DENSE = (129, 97)
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Misfit(PixelShift):
-    """What is written instead of a lens, and how far it is from it, over the image and at infinity.
+    """The lens written in place of another one, and its error over the image and at infinity.
 
     Args:
         model: of the format.

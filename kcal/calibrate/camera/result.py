@@ -267,7 +267,7 @@ class Rejected:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SharedBoard:
-    """That a camera shared its board with others with which it was calibrated.
+    """The board that a camera shared with others in one calibration.
 
     Args:
         others: their places among the cameras, from 0.

@@ -108,7 +108,7 @@ class PlainLens(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Examination:
-    """What a calibration says against itself.
+    """Results of the checks that `examine` makes of a calibration.
 
     Args:
         halves: cameras from halves of the views; empty where there are too few views.

@@ -180,7 +180,7 @@ _LEAST_INVERSE_RANGE = 1e-5
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Features(MarkSource):
-    """Points matched between the images whose position nobody surveyed.
+    """Points matched between the images whose positions are not surveyed.
 
     A feature alone determines the epipolar geometry: relative pitch and roll. It determines relative yaw if something
     is known of its range, and the farther away it is, the less need be known: a summit 20 km ± 2 km away is
@@ -455,7 +455,7 @@ class StarBlock(MarkBlock):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class SkylineSource(Measurement):
-    """What the skylines in images of a rig tell of where its cameras look.
+    """What the skylines in images of a rig determine of its cameras' attitudes.
 
     They are one Gaussian, near the attitudes that fit the skylines alone: images of one camera, and cameras that stand
     side by side, share the errors of the terrain raster and of refraction. `kcal.rig.skyline_source` makes it.

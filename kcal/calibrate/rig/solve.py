@@ -227,7 +227,7 @@ class RigOptions:
 def solve_rig(
     data: RigData, options: RigOptions | None = None, progress: Callable[[str], None] = lambda _: None
 ) -> RigResult:
-    """Solve for the poses of all cameras of a rig (and their parameters, if asked) from everything that is known.
+    """Solve for the poses of all cameras of a rig, and their parameters if asked, from all data together.
 
     Least squares of all residuals over their standard deviations; landmarks, far features and boards are unknowns too
     and are eliminated. A robust loss finds the solution that most of the data agree on; what contradicts it is left

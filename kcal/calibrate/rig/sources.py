@@ -443,7 +443,7 @@ class MeasuredPosition(Measurement):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class RigData:
-    """All that a rig is solved from; any of it may be missing.
+    """The data that a rig is solved from; any of them may be missing.
 
     All of it is in one local frame in meters: east, north, up of an origin where anything is known on the Earth
     (`kcal.locate.survey` reads latitudes and longitudes), the first camera's frame where nothing is. The solver goes
