@@ -121,17 +121,12 @@ def _option_row(option: Any) -> str:
 
 def conclusions_page() -> str:
     """What to conclude from each measured page."""
-    about = "Each page is written by scripts of the repository, and ends with what they need. What each concludes:"
+    about = "Scripts of the repository write each page, which ends with what they need. Losses and conclusions:"
     lines = ["# Measured", "", about, ""]
     _, folder, order = SECTIONS[-1]
     for name in ordered([page.stem for page in (DOCS / folder).glob("*.md")], order):
-        title, opening = (DOCS / folder / f"{name}.md").read_text(encoding="utf-8").split("\n\n")[:2]
-        lines += [
-            f"## [{title.removeprefix('# ')}]({name}.md)",
-            "",
-            opening.removeprefix("**Conclusion.**").strip(),
-            "",
-        ]
+        title, *opening = (DOCS / folder / f"{name}.md").read_text(encoding="utf-8").split("\n\n")[:3]
+        lines += [f"## [{title.removeprefix('# ')}]({name}.md)", "", "\n\n".join(opening), ""]
     return "\n".join(lines)
 
 

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from kcal.cli.options import NAME as SETTINGS_FILE
-from scripts.docs_site import commands_page, navigation, ordered, with_descriptions
+from scripts.docs_site import commands_page, conclusions_page, navigation, ordered, with_descriptions
 from scripts.make_reference import DOORS, groups, page, page_of, public
 
 ROOT = Path(__file__).parents[1]
@@ -206,6 +206,7 @@ def test_a_measured_page_concludes_and_then_shows(page: Path) -> None:
     _, losses, conclusion, *shown = beginning.split("\n\n")
     assert losses.startswith("**Losses.** ")
     assert conclusion.startswith("**Conclusion.** ")
+    assert f"{losses}\n\n{conclusion}\n" in conclusions_page()
     assert any(block.startswith(("| ", "![")) for block in shown[:2])
     assert re.search(r"`(python -m scripts\.|scripts/)", "".join(shown))
 
