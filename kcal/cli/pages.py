@@ -40,7 +40,7 @@ def mark_command(
     port: kinds.Port = _MARK_PORT,
     browser: bool = True,
 ) -> None:
-    """Mark landmarks and targets on a local web page, and see at once what each mark is worth.
+    """Mark landmarks and targets on a local web page, and see the σ of each mark at once.
 
     A click snaps to the corner, cross, blob or pole end that is there and shows its σ, at least one pixel of the screen
     where the image is shown small. In the other image the epipolar curve appears with a band of two σ of the rig, and

@@ -39,7 +39,7 @@ def watch_command(
     parquet: Annotated[Path, Kind(metavar="PARQUET", writes=True)] | None = None,
     picture: kinds.Picture | None = None,
 ) -> None:
-    """Watch how the cameras of a rig turn, from what they see, and keep a history with the sigma of every moment.
+    """Measure how the cameras of a rig turn over time, from what they see, and keep a history with sigmas.
 
     Fixed features of the first images are found again in each camera at every look, and matched between the cameras
     once an hour. What moves is learned out. How the rig turns (sun, wind, temperature) is learned by maximum

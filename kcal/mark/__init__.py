@@ -1,1 +1,1 @@
-"""Mark landmarks and targets in both images on a local web page (`kcal mark`), and tell what each mark is worth."""
+"""Mark landmarks and targets in both images on a local web page (`kcal mark`), with the σ of each mark."""
