@@ -32,14 +32,18 @@ check: $(VENV)/.installed-dev
 
 # The folder kcal is there for the examples in its docstrings. One thread in each of the two processes: commands and
 # calibrations take one by themselves (kcal/threads.py), and what else tests compute would wait for each other.
+# Compiled modules are kept, whatever the shell says: commands that tests start would compile all of kcal each time.
+# A file's tests stay in one process, where they share what they have calibrated or rendered.
 test test-all: export OMP_NUM_THREADS = 1
 test test-all: export OPENBLAS_NUM_THREADS = 1
+test test-all: export PYTHONDONTWRITEBYTECODE =
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 test: check
-	$(BIN)/python -m pytest -n 2 -m "not slow" kcal tests
+	$(PYTEST) -m "not slow" kcal tests
 	@echo "left out: $$(grep -rh '^ *@pytest.mark.slow' tests | wc -l) slow tests; make test-all runs them, too"
 
 test-all: check
-	$(BIN)/python -m pytest -n 2 kcal tests
+	$(PYTEST) kcal tests
 
 fuzz: $(VENV)/.installed-dev
 	$(BIN)/python -m scripts.fuzz --minutes $(MINUTES)

@@ -88,6 +88,7 @@ def test_halves_are_blocks_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
     assert judged == [seen.names, seen.names[:4], seen.names[4:]]
 
 
+@pytest.mark.slow
 def test_the_experiment(monkeypatch: pytest.MonkeyPatch, written: Path, tmp_path: Path) -> None:
     """Every stage once; models that are left out take the results of the first one."""
     monkeypatch.setattr(solve, "ALL", {"14": "opencv5"})

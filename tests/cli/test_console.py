@@ -140,6 +140,7 @@ def test_long_names_are_errors_of_one_line(
     assert len([line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]) <= 1
 
 
+@pytest.mark.slow
 def test_a_pipe_is_an_error_at_once(tmp_path: Path) -> None:
     import os
 
@@ -385,6 +386,7 @@ def start_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return start_folder
 
 
+@pytest.mark.slow
 def test_help_loads_no_large_library(tmp_path: Path) -> None:
     assert len(helps()) > 20
     code = """import contextlib, io

@@ -62,6 +62,7 @@ def test_an_old_file_stays_until_the_new_one_is_whole(folder: Path) -> None:
     assert (folder / "left.yaml").read_text() == "old"
 
 
+@pytest.mark.slow
 def test_while_an_image_is_searched(folder: Path) -> None:
     """OpenCV's search goes on in a thread, from which Python's end would abort the process."""
     corners = np.array([[200, 150], [440, 160], [430, 330], [190, 320]], np.float32)

@@ -57,6 +57,7 @@ def live(folder: Path, *options: str, detector: str = "video_scenes:bright_spots
     return done.output
 
 
+@pytest.mark.slow
 def test_positions_and_clock_are_right_within_their_sigmas(folder: Path) -> None:
     told = live(folder, "--clock-sigma", "0.1")
     assert f"{FRAMES} moments, {2 * (FRAMES - 3)} positions" in told

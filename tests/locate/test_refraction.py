@@ -67,6 +67,7 @@ def test_landmarks_that_tell_it_tell_it() -> None:
     assert float(near.mounting_covariance()[6, 6].sqrt()) == pytest.approx(0.1, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_heights_have_the_errors_that_are_stated() -> None:
     """χ² of errors across the line of sight at 5 km, over draws of k, survey and marks; all parts of it are needed."""
     target = spread_points(1, 5000.0, 5000.0, 12)

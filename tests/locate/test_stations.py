@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import json
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
 RIG = Path(__file__).parents[1] / "io" / "rig.json"
 
 
-def survey(count: int = 4, seed: int = 0) -> tuple[Rig, RigData, Tensor]:
+def survey(count: int = 4, seed: int = 0) -> tuple[Rig, RigData]:
     """Stations 5 km from the middle that see landmarks of their own, and few in common."""
     rig, generator = ring(count, 5000.0), torch.Generator().manual_seed(seed)
     groups = [targets(8, generator, 800.0)]
@@ -47,12 +48,16 @@ def survey(count: int = 4, seed: int = 0) -> tuple[Rig, RigData, Tensor]:
         MeasuredPosition(camera=c, point=center + 0.3, sigma=tensor(0.5, 0.5, 0.5))
         for c, center in enumerate(rig.center)
     )
-    return rig, RigData(cameras=tuple(rig.each), names=rig.names, landmarks=landmarks, positions=positions), points
+    return rig, RigData(cameras=tuple(rig.each), names=rig.names, landmarks=landmarks, positions=positions)
+
+
+@functools.cache
+def solved(seed: int = 0) -> Rig:
+    return solve_rig(survey(seed=seed)[1]).stations(ORIGIN)
 
 
 def test_stations_are_solved_from_landmarks_of_their_own_and_their_file_says_all() -> None:
-    truth, data, _ = survey()
-    found = solve_rig(data).stations(ORIGIN)
+    truth, found = survey()[0], solved()
     errors = torch.cat([found.center - truth.center, torch.zeros(len(found), 0)], 1)
     assert found.root is not None
     spread = torch.cat([found.root[:, found.pose_columns(c)] for c in range(len(found))], 1)
@@ -64,14 +69,14 @@ def test_stations_are_solved_from_landmarks_of_their_own_and_their_file_says_all
     assert found.calibration.undetermined == ()
 
 
+@pytest.mark.slow
 def test_positions_from_solved_stations_are_inside_their_ellipses() -> None:
     squares = []
     for seed in range(6):
-        truth, data, _ = survey(seed=seed)
-        found = solve_rig(data).stations(ORIGIN)
+        truth = survey(seed=seed)[0]
         points = targets(50, torch.Generator().manual_seed(100 + seed))
         noise = 0.3 * torch.randn(50, len(truth), 2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-        located = Localizer(found)(marks(truth, points) + noise)
+        located = Localizer(solved(seed))(marks(truth, points) + noise)
         error = located.enu - points
         squares.append((error * torch.linalg.solve(located.covariance, error)).sum(-1))
     inside = float((torch.cat(squares) < 7.815).double().mean())
@@ -80,7 +85,7 @@ def test_positions_from_solved_stations_are_inside_their_ellipses() -> None:
 
 
 def test_one_camera_alone() -> None:
-    truth, data, _ = survey(count=2)
+    truth, data = survey(count=2)
     marks_of_one = data.landmarks
     assert marks_of_one is not None
     seen = marks_of_one.pixels[:, 0].isfinite().all(-1)
@@ -100,8 +105,7 @@ def test_one_camera_alone() -> None:
 
 
 def test_file_of_many_cameras(tmp_path: Path) -> None:
-    _, data, _ = survey()
-    rig = solve_rig(data).stations(ORIGIN)
+    rig = solved()
     path = save_rig(rig, tmp_path / "rig.json")
     again = load_rig(path)
     assert again.names == rig.names
@@ -166,8 +170,7 @@ def test_a_stereo_rig_gives_the_same_positions_and_covariances(tmp_path: Path, m
 
 
 def test_a_placed_rig_and_its_stations_stand_alike() -> None:
-    _, data, _ = survey(count=2)
-    result = solve_rig(data)
+    result = solve_rig(survey(count=2)[1])
     stereo, stations = placed_rig(result, ORIGIN), result.stations(ORIGIN)
     ours, theirs = station_mounting(stations, 0), stereo.mounting
     assert theirs is not None

@@ -64,6 +64,7 @@ def mark_both(page: Any, scene: MarkingSite, name: str, random: np.random.Genera
     page.wait_for_function("() => kcal.item().right")
 
 
+@pytest.mark.slow
 def test_a_whole_site_while_the_server_is_killed(site: tuple[Path, MarkingSite], tmp_path: Path) -> None:
     folder, scene = site
     arguments = [str(folder / f"{side}.png") for side in ("left", "right")]

@@ -127,6 +127,7 @@ def test_what_cannot_be_is_refused() -> None:
         PairBoxes(planned_rig(), AssociationOptions(anchor=3))
 
 
+@pytest.mark.slow
 def test_all_of_it_on_another_device() -> None:
     """No tensor of the CPU meets those of the device, and results come back there with the same values."""
     # The images are noise: looks cost much and refuse nothing.

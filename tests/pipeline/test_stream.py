@@ -456,6 +456,7 @@ sys.stdin.read()
 """
 
 
+@pytest.mark.slow
 def test_one_process_at_a_time_writes_an_output(tmp_path: Path) -> None:
     """The second one is refused and told who has it; after a kill, the next one goes on."""
     (tmp_path / "link.csv").symlink_to(tmp_path / "tracks.csv")

@@ -50,6 +50,7 @@ def test_a_rig_from_the_scene_and_a_tape(matched: MatchedPair) -> None:
     assert float(torch.rad2deg(found.sigma_rotation).max()) < 0.05
 
 
+@pytest.mark.slow
 def test_what_moves_is_found_by_time() -> None:
     pairs = [pair(1, van=0.0), pair(2, van=-9.0)]
     found = [match_scene(CAMERAS, one) for one in pairs]
@@ -100,6 +101,7 @@ def test_the_best_all_over_the_image_are_kept(matched: MatchedPair) -> None:
     assert (spread > 0.8 * found.pixels[:, 0].std(0)).all()
 
 
+@pytest.mark.slow
 def test_repeats_in_the_same_light_tell_less_than_they_count() -> None:
     """The errors of one thing are alike in pairs of one minute: they went for independent, and contradicted others."""
 

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from concurrent.futures import Future
+from unittest.mock import Mock
 
 import cv2
 import interrupted
@@ -34,6 +35,7 @@ from kcal.cli.main import app
 from kcal.io.camera_file import CameraFile, load_camera
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_board
+from kcal.threads import in_one_thread
 
 BOARD = Board(columns=6, rows=5, square=0.02)
 WHAT = ("--board", "6x5", "--square", "20mm")
@@ -122,6 +124,7 @@ def folder(place):
 
 
 class TestResults:
+    @pytest.mark.slow
     def test_is_what_detect_and_calibrate_give(self, folder, first, place):
         assert [(row.camera, row.status, row.views) for row in first] == [("east", "ok", 4), ("west", "ok", 4)]
         for name in ("east", "west"):
@@ -159,6 +162,7 @@ class TestResults:
         (folder / "west" / "3.png").rename(folder / "west" / "9.png")
         assert run(folder, place / "out")[1] == 1
 
+    @pytest.mark.slow
     def test_options_are_part_of_the_key(self, folder, place):
         assert run(folder, place / "out", BatchOptions(refine="saddle"))[1] == 10
         assert run(folder, place / "out", model="opencv4")[1] == 2
@@ -239,9 +243,20 @@ class TestSharing:
         return results
 
     @pytest.mark.slow
-    def test_it_is_what_python_gives(self, folder, place):
+    @in_one_thread  # several would add in another order
+    def test_it_is_what_python_gives(self, folder, place, monkeypatch):
         crew = Here()
         out = place / "out"
+        # A worker that fails leaves cameras as they are alone, and the next run tries again.
+        for kind in (WorkerDiedError, DegenerateError):
+            with monkeypatch.context() as patch:
+                patch.setattr("kcal.calibrate.batch.results.calibrate_again", Mock(side_effect=kind("out of memory")))
+                results = self.batch(folder, out, crew)
+            for row in results.rows():
+                assert "calibrated alone, without what other cameras tell of the board: out of memory" in row.warnings
+                assert row.rms is not None
+        # Lines of cameras that may measure a board together are kept until then.
+        assert (len(results._views), len(results._calibrated)) == (2, 2)
         self.batch(folder, out, crew)
         seen = [Observations.load(out / f"{name}.obs.json") for name in ("east", "west")]
         for name, result in zip(("east", "west"), calibrate_cameras(seen), strict=True):
@@ -251,18 +266,6 @@ class TestSharing:
         before = len(crew.tasks)
         self.batch(folder, out, crew)
         assert len(crew.tasks) == before
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("kind", [WorkerDiedError, DegenerateError])
-    def test_a_worker_that_fails_leaves_cameras_as_they_are_alone(self, folder, place, monkeypatch, kind):
-        def dies(*_):
-            raise kind("out of memory")
-
-        monkeypatch.setattr("kcal.calibrate.batch.results.calibrate_again", dies)
-        results = self.batch(folder, place / "out", Here())
-        for row in results.rows():
-            assert "calibrated alone, without what other cameras tell of the board: out of memory" in row.warnings
-            assert row.rms is not None
 
 
 def test_images_that_were_resized_are_scaled_and_it_is_said(folder, images, place):
@@ -392,16 +395,12 @@ def test_command_line(folder, place, monkeypatch):
     assert not (place / "none").exists()
 
 
-@pytest.mark.slow
-def test_only_the_lines_of_finished_cameras_are_kept(folder, place):
-    """Unless they measure a board together."""
-    for model, kept in (("pinhole", 0), ("hybrid", 2)):
-        jobs = read_jobs(folder, BOARD, model)
-        results = Results(place / model, jobs, BatchOptions())
-        run_tasks(results.tasks(lambda _: None), results.done, Here())
-        assert (len(results._views), len(results._calibrated)) == (kept, kept)
-        assert not any(results._pieces)
-        assert [(row.camera, row.status, row.views) for row in results.rows()] == [("east", "ok", 4), ("west", "ok", 4)]
+def test_the_lines_of_finished_cameras_are_not_kept(folder, place):
+    """Nor the views of cameras that will not measure a board together."""
+    results = Results(place / "out", read_jobs(folder, BOARD, "pinhole"), BatchOptions())
+    run_tasks(results.tasks(lambda _: None), results.done, Here())
+    assert (len(results._views), len(results._calibrated), any(results._pieces)) == (0, 0, False)
+    assert [(row.camera, row.status, row.views) for row in results.rows()] == [("east", "ok", 4), ("west", "ok", 4)]
 
 
 @pytest.mark.slow

@@ -446,6 +446,7 @@ def weak() -> list[CameraCalibrationResult]:
     return [capture(seed) for seed in range(8)]
 
 
+@pytest.mark.slow
 def test_ellipses_of_rich_models_hold_the_truth(weak: list[CameraCalibrationResult]) -> None:
     """8 captures; fewer than 6 inside 95 % ellipses happen once in 170. Gauss and Newton's held one in five."""
     assert sum(squared_distance(result) < 5.991 for result in weak) >= 6
@@ -465,6 +466,7 @@ def test_a_weak_prior_ends_nearer_to_the_truth(
         assert other.rms < one.rms * 1.03
 
 
+@pytest.mark.slow
 def test_sigma_is_the_covariances(plain: list[CameraCalibrationResult]) -> None:
     for result in plain:
         for k, name in enumerate(result.camera.names):

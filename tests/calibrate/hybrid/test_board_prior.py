@@ -198,6 +198,7 @@ def said(result: CameraCalibrationResult) -> list[str]:
     return [text for text in result.warnings if "the board bends" in text]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "wanted"),
     [
@@ -213,6 +214,7 @@ def test_what_views_do_is_told_by_the_evidence(name: str, wanted: list[str]) -> 
     assert fit.sigma == pytest.approx(SIGMA, rel=0.1 if name != "both" else 0.6)
 
 
+@pytest.mark.slow
 def test_bending_is_taken_out() -> None:
     """The camera is nearer the truth than that of a board that is held to be stiff; heights are those of the views."""
     fit, stiff = found("bent").hybrid, found("bent", bending=False).hybrid
@@ -232,6 +234,7 @@ def test_bending_is_taken_out() -> None:
     torch.testing.assert_close(again, fit.residuals, rtol=0, atol=1e-9, equal_nan=True)
 
 
+@pytest.mark.slow
 def test_a_few_views_do_not_loosen_the_others() -> None:
     """They have large factors of their own, and are named."""
     result = found("few")
@@ -255,6 +258,7 @@ def real(name: str) -> Observations:
     return Observations.load(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "wanted", "noise"),
     [

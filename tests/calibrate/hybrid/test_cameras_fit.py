@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 
@@ -62,6 +61,7 @@ def shared(passes: int) -> CamerasFit:
     return fit_cameras(sets, FitOptions(modes=MODES), names=["left", "right"], passes=passes)
 
 
+@pytest.mark.slow
 def test_a_shared_board_is_better_known() -> None:
     """Two cameras measure their board better than one, and their boards are the same."""
     found = shared(1)
@@ -81,6 +81,7 @@ def test_a_shared_board_is_better_known() -> None:
         assert float(((both.fit.state.board - board.amplitudes) / deviations(both.fit)).abs().max()) < 0.4
 
 
+@pytest.mark.slow
 def test_a_second_pass_changes_little() -> None:
     one, two = shared(1), shared(2)
     moved = (one.boards[0].amplitudes - two.boards[0].amplitudes).abs()
@@ -99,6 +100,7 @@ def test_two_prints_are_two_boards() -> None:
     assert all(c.nats < -500.0 for c in found.cameras)
 
 
+@pytest.mark.slow
 def test_turned_views_are_found_within_and_between_cameras() -> None:
     """The left camera read 4 of 9 views from the other end, the right one all but one."""
     left, right = (torch.tensor([2, 0, 2, 0, 2, 0, 0, 2, 0]), torch.tensor([2, 2, 2, 2, 0, 2, 2, 2, 2]))
@@ -189,7 +191,8 @@ def test_a_fleet_knows_its_lens() -> None:
 def test_bad_input() -> None:
     with pytest.raises(InputError, match="no observations"):
         measure_board([])
-    other = dataclasses.replace(shared(1).boards[0], board=Board(columns=8, rows=6, square=0.031))
+    known = {"amplitudes": torch.zeros(28).double(), "half": torch.eye(28).double(), "log_evidence": 0.0}
+    other = MeasuredBoard(name="other", board=Board(columns=8, rows=6, square=0.031), **known)
     seen = seen_by(camera(1), PRINT, 5, 1)
     with pytest.raises(InputError, match="show another board"):
         fit_cameras([seen], FitOptions(board=other))

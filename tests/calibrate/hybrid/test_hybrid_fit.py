@@ -350,6 +350,7 @@ def test_normal_equations_without_poses() -> None:
     torch.testing.assert_close(off @ off.T, reduced, rtol=1e-6, atol=1e-6 * float(reduced.diagonal().max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [60, 63])
 def test_the_start_of_a_narrow_lens(seed: int) -> None:
     """Five views of 60 degrees: projections of 160 degrees, whose angles hardly differ, must not win the start."""

@@ -57,6 +57,7 @@ def options(training: FieldTraining | None, field: nn.Module | None = None) -> C
     return CalibrationOptions(field=field or network(), training=training, board="exact", motion=False)
 
 
+@pytest.mark.slow
 def test_training_finds_what_fixed_features_and_twenty_coefficients_cannot() -> None:
     """A dent, seen at places that no corner had; by Gauss-Newton sooner than by Adam."""
     newton, adam, fixed = fitted(FieldTraining()), fitted(FieldTraining(optimizer="adam")), fitted(None)
@@ -68,6 +69,7 @@ def test_training_finds_what_fixed_features_and_twenty_coefficients_cannot() -> 
     assert newton.sigma == pytest.approx(NOISE, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_users_network_stays_and_the_camera_has_a_trained_copy() -> None:
     torch.manual_seed(1)
     given = Rings()
@@ -134,6 +136,7 @@ def test_a_turn_lowers_the_cost_and_a_narrow_prior_holds_the_weights() -> None:
     assert float(moved[1].abs().max()) < 1e-4 < 1e-2 < float(moved[0].abs().max())
 
 
+@pytest.mark.slow
 def test_the_layer_takes_it_too() -> None:
     pixels = capture().pixels().requires_grad_()
     found = calibrate_views(pixels, BOARD.points, SIZE, options(None))
@@ -143,8 +146,9 @@ def test_the_layer_takes_it_too() -> None:
     assert float(gradient[..., 0].sum()) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_it_is_compared_by_its_name() -> None:
-    found = compare_models(capture(), ["network"], groups="views", parts=2, options=options(None))
+    found = compare_models(capture(8), ["network"], groups="views", parts=2, options=options(None))
     assert found.models == ("network",)
     assert NOISE < found.rms["network"] < 1.0
 
