@@ -43,7 +43,8 @@ _MAKERS = {
 def named_modules(file: str) -> dict[str, str]:
     """The names that the stub beside a file has, and in which module each is defined."""
     lines = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8")).body
-    return {alias.name: str(line.module) for line in lines if isinstance(line, ast.ImportFrom) for alias in line.names}
+    found = [line for line in lines if isinstance(line, ast.Import | ast.ImportFrom)]
+    return {alias.name: str(getattr(line, "module", alias.name)) for line in found for alias in line.names}
 
 
 def door(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from kcal.texts import csv_line
@@ -14,11 +14,12 @@ class Table:
     r"""Rows of results.
 
     Args:
-        columns: name of each column for programs -> its head for people.
-        rows: cells, one for each column: a text; a value with its text; or None where there is none.
+        columns: name of each column for programs -> its head for people; or that and what writes a number: a template
+            as of `str.format`, or a function.
+        rows: cells, one for each column: a text; a number; a value with its text; or None where there is none.
 
     Example:
-        >>> found = Table({"model": "model", "rms_px": "RMS, px"}, [["opencv5", (0.12345, "0.123")], ["mine", None]])
+        >>> found = Table({"model": "model", "rms_px": ("RMS, px", "{:.3f}")}, [["opencv5", 0.12345], ["mine", None]])
         >>> found.cells
         [['model', 'RMS, px'], ['opencv5', '0.123'], ['mine', '']]
         >>> found.records
@@ -27,14 +28,14 @@ class Table:
         'model,rms_px\nopencv5,0.12345\nmine,\n'
     """
 
-    columns: Mapping[str, str]
-    rows: Sequence[Sequence[str | tuple[Any, str] | None]]
+    columns: Mapping[str, str | tuple[str, str | Callable[[Any], str]]]
+    rows: Sequence[Sequence[Any]]
 
     @property
     def cells(self) -> list[list[str]]:
         """Texts, the heads first."""
-        texts = [[cell[1] if isinstance(cell, tuple) else cell or "" for cell in row] for row in self.rows]
-        return [list(self.columns.values()), *texts]
+        heads, forms = zip(*((one, str) if isinstance(one, str) else one for one in self.columns.values()), strict=True)
+        return [[*heads], *([*map(_text, row, forms)] for row in self.rows)]
 
     @property
     def records(self) -> list[dict[str, Any]]:
@@ -46,3 +47,9 @@ class Table:
     def csv(self) -> str:
         """With every digit."""
         return "".join(map(csv_line, [self.columns, *(record.values() for record in self.records)]))
+
+
+def _text(cell: Any, form: str | Callable[[Any], str]) -> str:
+    if cell is None or isinstance(cell, str | tuple):
+        return cell[1] if isinstance(cell, tuple) else cell or ""
+    return form.format(cell) if isinstance(form, str) else form(cell)

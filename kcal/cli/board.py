@@ -10,19 +10,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 import kcal
 from kcal.cli import kinds, rooms
 from kcal.cli.console import board_words, ending_with, err, out, print_left_out, print_wrote, steps, tell, warn
 from kcal.cli.inputs import typed, typed_with
-from kcal.cli.options import Command, Kind, declared, group_with_default
+from kcal.cli.options import Kind
 from kcal.errors import InputError
 from kcal.files import check_writable, is_stream, make_folder, source_name, write_atomic
-
-app = typer.Typer(
-    cls=group_with_default("print"), rich_markup_mode="markdown", help="Draw a board to print, and measure it later."
-)
 
 
 def print_command(
@@ -118,10 +112,6 @@ def measure_command(
             f"{', '.join(board.observations)}. Two prints of one pattern are two boards; measure {others} apart"
         )
     print_wrote(output, picture)
-
-
-app.command("print", cls=Command)(declared(print_command))
-app.command("measure", cls=Command)(declared(measure_command))
 
 
 # `kcal detect`: images to an observations file.
@@ -221,14 +211,13 @@ def detect_command(
         observed = [seen]
         turned = rooms.turned_images([path for path in paths if os.path.isfile(path)])
         source = f"of {len(paths)} images"
-    for path, observations in zip(outputs, observed, strict=True):
-        observations.save(path)
-    if gallery is not None or coverage is not None:
-        if gallery is not None:
-            tiles = [rooms.FailedImage(name, path, found.reason, found.rejected) for name, path, found in failed]
-            kcal.report.save_picture(gallery, rooms.gallery_figure(observations, tiles))
-        if coverage is not None:
-            kcal.report.save_picture(coverage, rooms.coverage_figure(observations))
+    for path, one in zip(outputs, observed, strict=True):
+        one.save(path)
+    if gallery is not None:
+        tiles = [rooms.FailedImage(name, path, found.reason, found.rejected) for name, path, found in failed]
+        kcal.report.save_picture(gallery, rooms.gallery_figure(observed[0], tiles))
+    if coverage is not None:
+        kcal.report.save_picture(coverage, rooms.coverage_figure(observed[0]))
 
     views = [view for one in observed for view in one.views]
     failures = [failure for one in observed for failure in one.failures]

@@ -12,12 +12,13 @@ import kcal
 from kcal.cli import console, kinds, rooms
 from kcal.cli.board import given_board
 from kcal.cli.console import err, out, print_styled, print_table, print_wrote, steps, tell, warn
-from kcal.cli.inputs import BOARD, calibrated_camera, check_file, pixel_sigma_of
+from kcal.cli.inputs import BOARD, check_file, pixel_sigma_of, single_camera
 from kcal.cli.options import Kind, Rare, Several
 from kcal.cli.report import NO, judged, told_usable
 from kcal.cli.stars import by_night, joined_by_stars
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_picture, check_writable, make_folder
+from kcal.table import Table
 from kcal.texts import measured_text, number_text, percent_text
 
 _T = TypeVar("_T")
@@ -93,16 +94,11 @@ def told_calibration(
         sigma_px={"center": brief.center, "border": brief.border, "worst": brief.worst},
         unreached=brief.unreached,
         focal_px=None if brief.focal is None else brief.focal.value.tolist(),
-        focal_sigma_px=None if brief.focal is None else _without_nan(brief.focal.sigma.tolist()),
+        focal_sigma_px=None if brief.focal is None else brief.focal.sigma.tolist(),
         parameters=dict(zip(result.camera.names, result.camera.params.tolist(), strict=True)),
         sigma=result.sigma,
         advice=result.advice,
     )
-
-
-def _without_nan(values: list[float]) -> list[float | None]:
-    """As JSON has them: None for NaN."""
-    return [value if value == value else None for value in values]
 
 
 def _parameters(result: rooms.CameraCalibrationResult) -> list[list[str]]:
@@ -137,7 +133,7 @@ def calibrate_command(
     reject: bool = False,
     reject_limit: Rare[Annotated[float, Kind(metavar="SHARE")]] = 0.1,
     temperature: Rare[kinds.Celsius] | None = None,
-    setting: list[kinds.Settings] | None = None,
+    setting: kinds.Settings | None = None,
     name: Rare[str] = "",
     model: Annotated[str, Kind(metavar="NAME")] = "hybrid",
     require: Annotated[kinds.Needs | None, Kind(panel=_USE)] = None,
@@ -147,10 +143,10 @@ def calibrate_command(
     focal: Rare[kinds.Pixels] | None = None,
     fov: Rare[kinds.Degrees] | None = None,
     board_warp: _Parametric[bool] = False,
-    fix: _Parametric[list[kinds.Fixed] | None] = None,
+    fix: _Parametric[kinds.Fixed | None] = None,
     tie: _Parametric[Annotated[list[str] | None, Kind(metavar="NAME=NAME")]] = None,
     free: _Parametric[Annotated[list[str] | None, Kind(metavar="NAME")]] = None,
-    prior: _Parametric[list[kinds.Prior] | None] = None,
+    prior: _Parametric[kinds.Prior | None] = None,
     weak_prior: _Parametric[Annotated[float, Kind(metavar="SHARE", least=0)]] = 0.3,
     camera: _Parametric[kinds.CameraFile] | None = None,
     loss: _Parametric[Annotated[str | None, Kind(metavar="KIND")]] = None,
@@ -218,7 +214,7 @@ def calibrate_command(
         loss: Robust loss against wrong corners: huber, cauchy or tukey.
         loss_scale: Residual at which the robust loss sets in.
     """
-    count, settings = len(obs or [output]), kinds.stated_once(setting, "--setting")
+    count, settings = len(obs or [output]), setting or {}
     for key, numbers in settings.items():
         if len(numbers) not in (1, count):
             raise InputError(f"--setting {key}: {len(numbers)} numbers for {count} cameras; give one, or one for each")
@@ -235,8 +231,6 @@ def calibrate_command(
     places = _camera_files(obs, output, picture, report, name)
     if model not in ("hybrid", "network"):
         kcal.lens.LensModel.named(model)
-    known = None if camera is None else calibrated_camera(camera)
-
     unknown = set(without or ()) - {"motion", "bending"}
     if unknown:
         raise InputError(f"--without {unknown.pop()}: write motion or bending")
@@ -249,12 +243,12 @@ def calibrate_command(
         board_warp=board_warp,
         focal=focal,
         field_of_view=fov,
-        fixed=kinds.stated_once(fix, "--fix"),
+        fixed=fix or {},
         tied=tuple(tuple(name.strip() for name in text.split("=")) for text in tie or []),
         free=tuple(free or []),
-        priors=kinds.stated_once(prior, "--prior"),
+        priors=prior or {},
         weak_prior=weak_prior or None,
-        camera=known,
+        camera=None if camera is None else single_camera(camera),
         loss=None if loss is None else kcal.solve.RobustLoss(kind=loss, scale=loss_scale),  # type: ignore[arg-type]
         reject=rooms.OutlierRejection(limit=reject_limit) if reject else None,
     )
@@ -276,13 +270,12 @@ def calibrate_command(
     failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
     usable = True
     figures: dict[str, dict[str, Any]] = {}
-    for place, result in zip(places, outcomes, strict=True):
+    for i, (place, result) in enumerate(zip(places, outcomes, strict=True)):
         if len(places) > 1:
             print_styled(place.name, ".*")
         if isinstance(result, KcalError):
-            warn(f"{place.name}: {console.with_command(str(result), cure(result, places.index(place)))}")
+            warn(f"{place.name}: {console.with_command(str(result), cure(result, i))}")
             continue
-        i = places.index(place)
         stood = {key: numbers[i % len(numbers)] for key, numbers in settings.items()}
         stated = kcal.lens.LensSetting(values=stood) if stood else None
         source = place.observations.name
@@ -342,12 +335,12 @@ def _camera_files(
             for folder in filter(None, files):
                 make_folder(folder)
             files = output / f"{own}.camera.json", picture and picture / f"{own}.png", report and report / f"{own}.html"
-        places.append(_CameraFiles(path, *files, own))
-    for place in places:
+        place = _CameraFiles(path, *files, own)
         for file in filter(None, (place.output, place.report)):
             check_writable(file, *observations)
         if place.picture is not None:
             check_picture(place.picture)
+        places.append(place)
     return places
 
 
@@ -414,8 +407,17 @@ def batch_command(
     except KeyboardInterrupt:
         err.print("interrupted; what is finished is kept: run the same command to continue")
         raise typer.Exit(130) from None
-    heads = ["camera", "views", "RMS px", "focal px", "± σ", "cx", "cy", "model", "note"]
-    print_table([heads, *map(_cells, report.rows)], left=(0, 7, 8))
+    columns = {
+        "camera": "camera", "views": "views", "rms": ("RMS px", "{:.4f}"), "focal": ("focal px", "{:.3f}"),
+        "sigma_focal": ("± σ", "{:.3f}"), "cx": ("cx", "{:.3f}"), "cy": ("cy", "{:.3f}"), "model": "model",
+        "note": "note",
+    }  # fmt: skip
+    rows = [
+        [row.camera, f"{row.views} of {row.images}", row.rms, row.focal, row.sigma_focal, row.cx, row.cy, row.model,
+         f"failed: {row.error}" if row.error else row.warnings]
+        for row in report.rows
+    ]  # fmt: skip
+    print_table(Table(columns, rows).cells, left=(0, 7, 8))
     out.print(f"{report.reused} of {report.total} pieces of work were there already")
     print_wrote(report.summary)
     failed = [row.camera for row in report.rows if row.error]
@@ -423,12 +425,3 @@ def batch_command(
         raise DegenerateError(
             f"{len(failed)} of {len(report.rows)} cameras failed: {', '.join(failed[:5])}; see the table"
         )
-
-
-def _cells(row: rooms.SummaryRow) -> list[str]:
-    numbers = ["", "", "", "", ""]
-    if row.rms is not None:
-        spread = "" if row.sigma_focal is None else f"{row.sigma_focal:.3f}"
-        numbers = [f"{row.rms:.4f}", f"{row.focal:.3f}", spread, f"{row.cx:.3f}", f"{row.cy:.3f}"]
-    note = f"failed: {row.error}" if row.error else row.warnings
-    return [row.camera, f"{row.views} of {row.images}", *numbers, row.model, note]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Annotated, Any
 
 import kcal
 from kcal.cli import kinds, rooms
 from kcal.cli.console import out, print_wrote, steps, tell, tell_table, warn
-from kcal.cli.inputs import calibrated_camera, single_camera
+from kcal.cli.inputs import single_camera
 from kcal.cli.options import Kind, Several
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
@@ -112,13 +113,11 @@ def diff_command(
         turn: Turn the second camera until it agrees best with the first.
         picture: maps of the difference and of its σ.
     """
-    import torch
-
     cameras = [single_camera(source) for source in (first, second)]
     then, now = (_temperature(camera) for camera in cameras)
     for source, camera in zip((first, second), cameras, strict=True):
         out.print(f"{source}: {_history(camera)}")
-    found = kcal.lens.camera_difference(*cameras, at=distance, rotation=None if turn else torch.eye(3))
+    found = kcal.lens.camera_difference(*cameras, at=distance, rotation=None if turn else rooms.torch.eye(3))
     tell(
         at_m=None if math.isinf(distance) else distance,
         rms_px=found.rms,
@@ -159,7 +158,7 @@ def _history(camera: kcal.Camera) -> str:
 
 
 def interpolate_command(
-    cameras: list[kinds.CalibratedCamera], *, setting: list[kinds.Setting], output: kinds.NewFile
+    cameras: list[kinds.CalibratedCamera], *, setting: kinds.Setting, output: kinds.NewFile
 ) -> None:
     """Make a camera at a zoom or focus between those at which its lens was calibrated, with its error bars.
 
@@ -176,17 +175,16 @@ def interpolate_command(
             not given); may be repeated.
         output: Camera file to write.
     """
-    stated = kinds.stated_once(setting, "--setting")
-    wanted = {name: one.value for name, one in stated.items()}
-    spread = {name: one.sigma for name, one in stated.items() if one.sigma is not None}
+    wanted = {name: one.value for name, one in setting.items()}
+    spread = {name: one.sigma for name, one in setting.items() if one.sigma is not None}
 
     loaded = [kcal.load_camera(path) for path in cameras]
     found = rooms.camera_at_setting(loaded, wanted, setting_sigma=spread, names=[str(path) for path in cameras])
     *stood, made = [camera.calibration and camera.calibration.setting for camera in (*loaded, found.camera)]
-    weights = [(weight, number_text(weight, 0.01, sign=True)) for weight in found.weights]
-    columns = {name: name for name in ("camera", "setting", "weight")}
-    rows = list(zip(map(str, cameras), map(str, stood), weights, strict=True))
-    tell_table("cameras", Table(columns, rows), left=(0, 1))
+    weight = functools.partial(number_text, sigma=0.01, sign=True)
+    rows = [*zip(map(str, cameras), map(str, stood), found.weights, strict=True)]
+    table = Table({"camera": "camera", "setting": "setting", "weight": ("weight", weight)}, rows)
+    tell_table("cameras", table, left=(0, 1))
     parts = {
         "calibrations": found.calibration_px,
         "interpolation": found.interpolation_px,
@@ -232,7 +230,7 @@ def bake_command(
     path = check_writable(output or camera.with_name(f"{name}_lookup.npz"), camera)
 
     with steps("baking", None):
-        lookup = kcal.lens.bake(calibrated_camera(camera), tolerance)
+        lookup = kcal.lens.bake(single_camera(camera), tolerance)
     kcal.lens.save_lookup(lookup, path)
     for which, table, bound, coverage in zip(
         ("pixels to rays", "rays to pixels"),

@@ -239,9 +239,7 @@ def _board_ends(output: Path, board: kcal.Board) -> kcal.locate.Marks:
         for side, file in enumerate((left, right))
     ]
     names = [f"{Path(pair[0]).stem} {word}" for pair in pairs for word in ("first", "last")]
-    import torch
-
-    both = torch.isfinite(torch.cat(marks, 1)).all(-1)
+    both = rooms.torch.isfinite(rooms.torch.cat(marks, 1)).all(-1)
     chosen = tuple(name for name, seen in zip(names, both.tolist(), strict=True) if seen)
     return kcal.locate.Marks.of_pair(chosen, marks[0][both], marks[1][both])
 

@@ -62,32 +62,21 @@ def cameras_and_rig(path: Path) -> tuple[rooms.ImportedCameras, kcal.Rig | None]
     return found, found.rig() if found.is_rig() else None
 
 
-def single_camera(source: str) -> kcal.Camera:
-    """The camera that FILE or FILE:CAMERA names."""
-    path, name = named_source(source)
-    # Without the readers of other programs' files, which take long to load.
-    if (file_kind(path), name) in (("camera", None), ("rig", "left"), ("rig", "right")):
-        return calibrated_camera(source)
-    found = kcal.lens.import_cameras(path)
-    warn(*found.notes)
-    return picked(found, name, source)
-
-
-def calibrated_camera(source: str | Path) -> kcal.Camera:
-    """The camera of a file of kcal, or one of a rig of kcal: `rig.json:left`.
+def single_camera(source: str | Path) -> kcal.Camera:
+    """The camera that FILE or FILE:CAMERA names, of kcal or of another program.
 
     Raises:
-        FileError: no such file.
-        InputError: the rig has no camera of that name.
+        InputError: there is no camera of that name, or there are several and none was named.
     """
     path, name = named_source(str(source))
-    if name is None:
+    # Without the readers of other programs' files, which take long to load.
+    if file_kind(path) == "camera" and name is None:
         return kcal.load_camera(path)
-    if name not in ("left", "right"):
-        raise InputError(f"{source}: a rig has the cameras left and right, and none named {name!r}")
-
-    rig = rooms.load_pair(path)
-    return rig.left if name == "left" else rig.right
+    if file_kind(path) == "rig" and name in (rig := kcal.load_rig(path)).names:
+        return rig.each[rig.names.index(name)]
+    found = kcal.lens.import_cameras(path)
+    warn(*found.notes)
+    return picked(found, name, str(source))
 
 
 # Check what was given before anything is loaded: is each file there, and is it what the command needs there?

@@ -5,17 +5,15 @@ from __future__ import annotations
 import datetime
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple
 
 import kcal
 from kcal import values
-from kcal.cli import inputs
+from kcal.cli import inputs, rooms
 from kcal.cli.options import Kind
 from kcal.errors import InputError
 from kcal.files import check_picture
 from kcal.values import WithSigma
-
-_T = TypeVar("_T")
 
 # Numbers with their unit. `Positive...` and `Least...` refuse others as wrong usage.
 Meters = Annotated[float, Kind(metavar="M")]
@@ -51,6 +49,8 @@ def _read_height(text: str, name: str) -> tuple[float, float]:
     return (found.value, 1.0 if found.sigma is None else found.sigma)
 
 
+# By a reader of a room, which is loaded with it.
+Aging = Annotated[float, Kind(metavar="9h:DEG,8K:DEG", read=lambda text, name: rooms.parse_aging(text, name))]
 Height = Annotated[tuple[float, float], Kind(metavar="M±SIGMA", read=_read_height)]
 Clock = Annotated[float, Kind(metavar="S")]
 
@@ -155,11 +155,10 @@ RefineMethod = Annotated[
 ]
 
 
-def _read_needs(text: str, _name: str) -> tuple[kcal.report.Requirement, ...]:
-    return kcal.report.Requirement.parse(text)
-
-
-Needs = Annotated[tuple[Any, ...], Kind(metavar="RANGE:ERROR", read=_read_needs, setting=True)]
+Needs = Annotated[
+    tuple[Any, ...],
+    Kind(metavar="RANGE:ERROR", read=lambda text, _: kcal.report.Requirement.parse(text), setting=True),
+]
 
 
 _SETTING = "NAME=NUMBER, for example focus=3.2"
@@ -188,24 +187,10 @@ def _read_prior(text: str, name: str) -> tuple[str, tuple[float, float]]:
     return key, (mean, sigma)
 
 
-Setting = Annotated[tuple[str, WithSigma], Kind(metavar="NAME=NUMBER[±SIGMA]", read=_read_setting)]
-Settings = Annotated[tuple[str, tuple[float, ...]], Kind(metavar="NAME=NUMBER", read=_read_settings)]
-Fixed = Annotated[tuple[str, Any], Kind(metavar="NAME[=VALUE]", read=_read_fixed)]
-Prior = Annotated[tuple[str, Any], Kind(metavar="NAME=VALUE±SIGMA", read=_read_prior)]
-
-
-def stated_once(given: list[tuple[str, _T]] | None, option: str) -> dict[str, _T]:
-    """What an option that may be repeated says of each name.
-
-    Raises:
-        InputError: a name that is stated twice.
-    """
-    found: dict[str, _T] = {}
-    for name, value in given or ():
-        if name in found:
-            raise InputError(f"{option}: {name} is stated twice")
-        found[name] = value
-    return found
+Setting = Annotated[dict[str, WithSigma], Kind(metavar="NAME=NUMBER[±SIGMA]", read=_read_setting)]
+Settings = Annotated[dict[str, tuple[float, ...]], Kind(metavar="NAME=NUMBER", read=_read_settings)]
+Fixed = Annotated[dict[str, float | None], Kind(metavar="NAME[=VALUE]", read=_read_fixed)]
+Prior = Annotated[dict[str, tuple[float, float]], Kind(metavar="NAME=VALUE±SIGMA", read=_read_prior)]
 
 
 # Files that are read: what they must be.

@@ -17,7 +17,7 @@ from kcal.cli.console import err, on_signals, steps
 from kcal.cli.inputs import pixel_sigma_of
 from kcal.cli.locate import LocateOptions, pair_localizer
 from kcal.cli.options import Kind, Only, Rare, taken
-from kcal.errors import InputError, with_extra
+from kcal.errors import InputError
 from kcal.files import check_writable
 from kcal.texts import measured_text
 
@@ -126,8 +126,6 @@ def live_command(
         )  # fmt: skip
         page = None
         if port is not None:
-            with with_extra("mark", "--port needs"):
-                pass
             page = rooms.LiveMap(stream.run, port, start)
             err.print(f"live map: {page.address}")
         stream.shown = _progress(advance, stream, page)
@@ -206,9 +204,6 @@ def _videos(
     options: kcal.track.AssociationOptions,
     match_sigma: float,
 ) -> rooms.Videos:
-    with with_extra("video", "videos need"):
-        pass
-
     # As `python -m` does: a detector beside which the command is run is found.
     sys.path.insert(0, os.getcwd())
 
@@ -216,11 +211,8 @@ def _videos(
         # Before the first moment the estimate is the prior.
         return tracker.clock_estimate(camera).offset(max(tracker.time, tracker.shared.start or 0.0))[0]
 
-    def tell(text: str) -> None:
-        err.print(text)
-
     return rooms.Videos(
-        videos, rig, rooms.load_detector(detector), options, late=late, match_sigma=match_sigma, tell=tell
+        videos, rig, rooms.load_detector(detector), options, late=late, match_sigma=match_sigma, tell=err.print
     )
 
 

@@ -64,10 +64,6 @@ def _print_positions(
 # What `kcal locate` does with a table, part by part: pairs of a rig of two cameras, or marks of any number of them.
 
 
-def _read_aging(text: str, name: str) -> float:
-    return rooms.parse_aging(text, name)
-
-
 _SETTING = Kind(setting=True)
 
 
@@ -106,7 +102,7 @@ class LocateOptions:
     grid: Rare[Annotated[str, Kind(metavar="CRS")] | None] = None
     pixel_sigma: kinds.PixelSigma | None = None
     yaw_sigma: kinds.DegreesSigma = 0.0
-    aged: Rare[Annotated[float, Kind(metavar="9h:DEG,8K:DEG", read=_read_aging)] | None] = None
+    aged: Rare[kinds.Aging | None] = None
     history: kinds.History | None = None
     refraction: Rare[kinds.MeasuredRefraction | None] = None
     height: kinds.Height | None = None

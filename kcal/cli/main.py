@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 import warnings
 from collections.abc import Iterable, Iterator
@@ -14,26 +15,8 @@ from typer.core import TyperGroup
 
 import kcal
 from kcal.cli import inputs
-from kcal.cli.board import app as board
-from kcal.cli.board import detect_command
-from kcal.cli.calibrate import batch_command, calibrate_command
-from kcal.cli.compare import bake_command, compare_command, diff_command, interpolate_command
 from kcal.cli.console import err, print_label, print_replaced, warn, working
-from kcal.cli.demo import demo_command
-from kcal.cli.exchange import export_command, import_command, schema_command
-from kcal.cli.init import init_command
-from kcal.cli.live import live_command
-from kcal.cli.locate import locate_command
-from kcal.cli.options import Command, declared, defaults_of, read_settings
-from kcal.cli.pages import capture_command, mark_command
-from kcal.cli.rectify import rays_command, rectify_command
-from kcal.cli.report import check_command, report_command
-from kcal.cli.rig import app as rig
-from kcal.cli.rig import place_command, station_command
-from kcal.cli.show import show_command, view_command
-from kcal.cli.sites import budget_command, sites_command
-from kcal.cli.stars import stars_command
-from kcal.cli.watch import watch_command
+from kcal.cli.options import Command, declared, defaults_of, group_with_default, read_settings
 from kcal.errors import KcalError, KcalWarning
 from kcal.files import written_files
 from kcal.interrupts import only_interruptions
@@ -111,20 +94,30 @@ def _global_options(
     pass
 
 
-COMMANDS = (
-    demo_command, init_command, capture_command, detect_command, calibrate_command, interpolate_command,
-    compare_command, batch_command, mark_command, station_command, place_command, stars_command, locate_command,
-    live_command, watch_command, budget_command, sites_command, rectify_command, rays_command, bake_command,
-    export_command, import_command, schema_command, show_command, view_command, diff_command, check_command,
-    report_command,
-)  # fmt: skip
+# Each command, and the module here that has its function.
+COMMANDS = {
+    "demo": "demo", "init": "init", "capture": "pages", "detect": "board", "calibrate": "calibrate",
+    "interpolate": "compare", "compare": "compare", "batch": "calibrate", "mark": "pages", "station": "rig",
+    "place": "rig", "stars": "stars", "locate": "locate", "live": "live", "watch": "watch", "budget": "sites",
+    "sites": "sites", "rectify": "rectify", "rays": "rectify", "bake": "compare", "export": "exchange",
+    "import": "exchange", "schema": "exchange", "show": "show", "view": "show", "diff": "compare", "check": "report",
+    "report": "report", "board print": "board", "board measure": "board", "rig solve": "rig", "rig check": "rig",
+}  # fmt: skip
 # They run on, or write where they are told.
-WITHOUT_JSON = (capture_command, mark_command, live_command, watch_command)
-for command in COMMANDS:
-    run = declared(command, json=command not in WITHOUT_JSON)
-    app.command(command.__name__.removesuffix("_command"), cls=Command)(run)
-app.add_typer(board, name="board")
-app.add_typer(rig, name="rig")
+WITHOUT_JSON = ("capture", "mark", "live", "watch")
+GROUPS = {
+    "board": ("print", "Draw a board to print, and measure it later."),
+    "rig": ("solve", "Solve a rig, and check it later."),
+}
+groups = {"": app}
+for group, (default, about) in GROUPS.items():
+    groups[group] = typer.Typer(cls=group_with_default(default), rich_markup_mode="markdown", help=about)
+    app.add_typer(groups[group], name=group)
+for words, module in COMMANDS.items():
+    group, _, name = words.rpartition(" ")
+    function = getattr(importlib.import_module(f"kcal.cli.{module}"), f"{name}_command")
+    run = declared(function, json=name not in WITHOUT_JSON)
+    groups[group].command(name, cls=Command, hidden=words == "rig solve")(run)
 
 
 def main() -> None:
@@ -134,15 +127,13 @@ def main() -> None:
         warn(str(message)) if issubclass(kind, KcalWarning) else shown(message, kind, *where)
     )
     try:
-        app()
+        sys.exit(app())
     except KcalError as error:
-        print_label("error", " ".join(str(error).split()), "bold red")
-        sys.exit(1)
+        text = " ".join(str(error).split())
     except OSError as error:
         # What no command foresaw of files and folders: a disk that was taken away, a folder that may not be listed.
-        name = f"{error.filename}: " if error.filename else ""
-        print_label("error", f"{name}{error.strerror or error}", "bold red")
-        sys.exit(1)
+        text = f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}"
     except MemoryError:
-        print_label("error", "not enough memory; use fewer or smaller inputs", "bold red")
-        sys.exit(1)
+        text = "not enough memory; use fewer or smaller inputs"
+    print_label("error", text, "bold red")
+    sys.exit(1)

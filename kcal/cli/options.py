@@ -4,7 +4,7 @@
 
 Parameters before the `*` are arguments, those after it are options. A `Kind` in the annotation tells the metavar, how
 the text is read, and the flags if they are not the parameter's name. A parameter whose type is a dataclass stands for
-the options that are its fields.
+the options that are its fields. One whose type is a dictionary may be repeated, for another name each time.
 """
 
 from __future__ import annotations
@@ -233,9 +233,15 @@ class _Option:
         """What the command gets."""
         if self.kind.read is None or given is None:
             return given
-        if isinstance(given, list | tuple):
-            return type(given)(map(self._read, given))
-        return self._read(str(given))
+        if not isinstance(given, list | tuple):
+            return self._read(str(given))
+        read = type(given)(map(self._read, given))
+        if dict not in map(get_origin, (self.type, *get_args(self.type))):
+            return read
+        names = [name for name, _ in read]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise InputError(f"{self.label}: {twice[0]} is stated twice")
+        return dict(read)
 
     def _checked(self, text: str | None) -> str | None:
         if text is not None:
@@ -262,7 +268,7 @@ def _taken_apart(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
     if origin is Annotated:
         inner, more = _taken_apart(parts[0])
         return inner, (*more, *parts[1:])
-    if origin in (Union, types.UnionType, list, tuple):
+    if origin in (Union, types.UnionType, list, tuple, dict):
         apart = [_taken_apart(part) for part in parts]
         metadata = tuple(dict.fromkeys(one for _, more in apart for one in more))
         plain = tuple(inner for inner, _ in apart)
@@ -277,7 +283,7 @@ def _of_text(plain: Any) -> Any:
     origin, parts = get_origin(plain), tuple(map(_of_text, get_args(plain)))
     if origin in (Union, types.UnionType):
         return Union[parts]  # noqa: UP007
-    return list[str] if origin is list else str
+    return list[str] if origin in (list, dict) else str
 
 
 def described(docstring: str | None) -> tuple[str, dict[str, str]]:

@@ -14,7 +14,7 @@ from kcal.cli.board import board_in_images, given_board
 from kcal.cli.console import err, out, show_page, warn
 from kcal.cli.inputs import IMAGES, pixel_sigma_of
 from kcal.cli.options import Kind
-from kcal.errors import InputError, KcalError, with_extra
+from kcal.errors import InputError, KcalError
 
 _MARK_PORT, _CAPTURE_PORT = 8347, 8348
 
@@ -71,13 +71,11 @@ def mark_command(
         reference_images: With --reference: the old images.
         browser: Open the page in the browser.
     """
-    with with_extra("mark", "kcal mark needs"):
-        from kcal.mark.server import marking_app
-
     if rig is not None and cameras is not None:
         raise InputError("give --rig or --cameras, not both: a rig file contains its cameras")
     if (reference is None) != (reference_images is None):
         raise InputError("--reference and --reference-images belong together: old marks, and the images they are in")
+    page = rooms.marking_app  # what it needs is missed before anything is written
     pictures = rooms.open_pictures(left, right)
     known = None if rig is None else rooms.load_pair(rig)
     own = None if cameras is None else (kcal.load_camera(cameras[0]), kcal.load_camera(cameras[1]))
@@ -86,9 +84,7 @@ def mark_command(
     desk = rooms.Desk(pictures, session, own, known, old)
     try:
         desk.check_sizes()
-        server = rooms.LocalServer(
-            lambda token, hosts: marking_app(desk, token, hosts), port, fallback=port == _MARK_PORT
-        )
+        server = rooms.LocalServer(lambda token, hosts: page(desk, token, hosts), port, fallback=port == _MARK_PORT)
         show_page(server.address, "marking page", browser=browser)
         if session.version:
             err.print(f"continued after {session.version} actions in {session.files.log}")
@@ -168,10 +164,8 @@ def capture_command(
     ]
     server = None
     if page:
-        with with_extra("mark", "the page needs", ", or give --no-page"):
-            from kcal.capture.session import capture_app
         server = rooms.LocalServer(
-            lambda token, hosts: capture_app(session, stop, token, hosts), port, fallback=port == _CAPTURE_PORT
+            lambda token, hosts: rooms.capture_app(session, stop, token, hosts), port, fallback=port == _CAPTURE_PORT
         )
         show_page(server.address, "capture page", browser=browser)
     try:

@@ -75,9 +75,7 @@ def convert_images(
 
 
 def _convert(data: bytes, path: Path, target: Path, module: kcal.lens.Undistort, note: str) -> None:
-    import torch
-
-    image = torch.from_numpy(rooms.decode_image(data, path))
+    image = rooms.torch.from_numpy(rooms.decode_image(data, path))
     (height, width), size = image.shape[:2], module.camera.size
     if (width, height) != size:
         raise InputError(f"{path}: the image is {width}x{height} px, the camera {size[0]}x{size[1]} px")
@@ -258,8 +256,6 @@ def _rectify_rig(rig: kcal.Rig, images: list[str], folder: Path, options: ViewOp
     rig_path, matrix_path = folder / "rectified.rig.json", folder / "Q.npy"
     extras = [rig_path, matrix_path, *(path for name in names for path in _extra_paths(folder, name, options))]
 
-    import torch
-
     def make() -> tuple[kcal.lens.StereoRectification, list[kcal.lens.Undistort]]:
         made = kcal.lens.StereoRectification(
             rig, alpha=options.alpha, size=options.size, field_of_view=options.fov, at=options.distance
@@ -267,7 +263,7 @@ def _rectify_rig(rig: kcal.Rig, images: list[str], folder: Path, options: ViewOp
         return made, [made.left, made.right]
 
     with _resampled(folder, sides, extras, make) as (both, modules):
-        kcal.save_rig(kcal.Rig.pair(both.camera, both.camera, torch.eye(3), -both.right_center), rig_path)
+        kcal.save_rig(kcal.Rig.pair(both.camera, both.camera, rooms.torch.eye(3), -both.right_center), rig_path)
         _save_array(matrix_path, both.depth_matrix)
         focal, _, cx, cy = both.camera.params[:4].tolist()
         out.print(f"both cameras: focal length {focal:.2f} px, cx {cx:.2f}, cy {cy:.2f}, baseline {rig.baseline:.6g} m")
@@ -285,10 +281,8 @@ def _extra_paths(folder: Path, name: str, options: ViewOptions) -> list[Path]:
 
 def _write_extras(folder: Path, name: str, module: kcal.lens.Undistort, options: ViewOptions) -> None:
     """Maps (2, H, W) for cv2.remap, (1, H, W, 2) for grid_sample with align_corners=True, and the mask."""
-    import torch
-
     if options.maps:
-        last = torch.tensor(module.camera.size, dtype=torch.float64) - 1.0
+        last = rooms.torch.tensor(module.camera.size, dtype=rooms.torch.float64) - 1.0
         _save_array(folder / f"{name}_map.npy", ((module.grid.double() + 1.0) * 0.5 * last).movedim(-1, 0).float())
         _save_array(folder / f"{name}_grid.npy", module.grid[None].float())
     if options.mask:

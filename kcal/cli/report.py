@@ -109,7 +109,7 @@ def warned_of(result: rooms.RigResult) -> list[rooms.Finding]:
 def _of_camera(
     path: Path, observations: list[Path], needs: tuple[kcal.report.Requirement, ...], baseline: float, mark_sigma: float
 ) -> Judged:
-    camera = single_camera(str(path))
+    camera = single_camera(path)
     name = (camera.calibration.name if camera.calibration else "") or path.name.split(".")[0]
     if not observations:
         found = rooms.stored_verdict(camera, needs, baseline=baseline, mark_sigma=mark_sigma, subject=name)
@@ -321,15 +321,14 @@ def _check_ranges(path: Path, ranges: Path, marks: Path | None, sigma: float | N
     rig, points = rooms.load_pair(path), rooms.read_known_ranges(ranges, marks)
     noise, note = pixel_sigma_and_source(sigma, rig)
     found = kcal.locate.check_ranges(rig, points.marks, points.ranges, points.sigmas, pixel_sigma=noise)
+    heads = {"known_m": "known m", "sigma_m": "±", "measured_m": "measured m", "low_m": "low", "high_m": "high"}
     columns = {
-        "name": "point", "known_m": "known m", "sigma_m": "±", "measured_m": "measured m", "low_m": "low",
-        "high_m": "high", "pull": "error / σ",
-    }  # fmt: skip
+        "name": "point",
+        **{name: (head, "{:.4g}") for name, head in heads.items()},
+        "pull": ("error / σ", "{:+.2f}"),
+    }
     numbers = (found.known, points.sigmas, found.measured, found.low, found.high, found.pulls)
-    rows = [
-        [name, *((value, f"{value:.4g}") for value in values[:-1]), (values[-1], f"{values[-1]:+.2f}")]
-        for name, *values in zip(found.names, *(column.tolist() for column in numbers), strict=True)
-    ]
+    rows = [*zip(found.names, *(column.tolist() for column in numbers), strict=True)]
     tell_table("ranges", Table(columns, rows))
     if note and points.marks.covariance is None:
         out.print(note, markup=False)
@@ -409,8 +408,6 @@ def _keep_refits(path: Path, key: str, refits: list[rooms.Refit]) -> None:
 
 def _kept_refits(path: Path, key: str) -> list[rooms.Refit]:
     """The refits of an earlier run; none where the file is of another camera, other ranges or another version."""
-    import torch
-
     if not path.exists():
         return []
     arrays = rooms.read_npz(read_bytes(path, _LARGEST_RUN), str(path), _LARGEST_RUN, "run of kcal check")
@@ -420,27 +417,29 @@ def _kept_refits(path: Path, key: str) -> list[rooms.Refit]:
         warn(f"{path} has refits of another camera, capture, range or version of kcal; they are made anew")
         return []
     try:
-        parts = zip(arrays["seed"].tolist(), torch.from_numpy(arrays["errors"]), strict=True)
+        parts = zip(arrays["seed"].tolist(), rooms.torch.from_numpy(arrays["errors"]), strict=True)
         return [rooms.Refit(seed, errors) for seed, errors in parts]
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"{path}: damaged; remove it and start again") from error
 
 
+def _tenths(share: float) -> str:
+    """Of a percent."""
+    return f"{100 * share:.1f}"
+
+
 def _told_refits(found: rooms.IntervalCheck, count: int) -> bool:
     """Print the answer."""
     columns = {
-        "range_m": "range", "share": "refits inside, %", "share_error": "±", "lowest_share": "lowest place, %",
-        "error_px": "error px, RMS", "stated_px": "stated px, RMS", "factor": "σ should be",
+        "range_m": ("range", rooms.range_label), "share": ("refits inside, %", _tenths), "share_error": ("±", _tenths),
+        "lowest_share": ("lowest place, %", lambda share: f"{100 * share:.0f}"),
+        "error_px": ("error px, RMS", "{:.3g}"), "stated_px": ("stated px, RMS", "{:.3g}"),
+        "factor": ("σ should be", "x {:.2f}"),
     }  # fmt: skip
-    rows = []
     parts = zip(found.ranges, found.shares, found.coverage, found.rms, found.factors, strict=True)
-    for at, (share, error), places, (seen, told), factor in parts:
-        lowest = float(places[places.isfinite()].min())
-        rows.append([
-            (at, rooms.range_label(at)), (share, f"{100 * share:.1f}"), (error, f"{100 * error:.1f}"),
-            (lowest, f"{100 * lowest:.0f}"), (seen, f"{seen:.3g}"), (told, f"{told:.3g}"),
-            (factor, f"x {factor:.2f}"),
-        ])  # fmt: skip
+    rows = [
+        [at, *shares, float(places[places.isfinite()].min()), *rms, factor] for at, shares, places, rms, factor in parts
+    ]
     tell_table("ranges", Table(columns, rows))
     if found.failed:
         warn(f"{found.failed} of {count} simulated captures could not be calibrated; they are not counted")
@@ -479,16 +478,14 @@ def _told_against(
     with steps(f"calibrating {path.name}", None):
         found = rooms.against_capture(result, second, options, ranges)
     columns = {
-        "range_m": "range", "seen_px": "seen px, RMS", "predicted_px": "predicted px, RMS",
-        "ratio": "seen / predicted", "probability": "probability",
+        "range_m": ("range", rooms.range_label), "seen_px": ("seen px, RMS", "{:.3g}"),
+        "predicted_px": ("predicted px, RMS", "{:.3g}"), "ratio": ("seen / predicted", "{:.2f}"),
+        "probability": ("probability", "{:.2g}"),
     }  # fmt: skip
     rows = []
     for at, one in zip(ranges, found, strict=True):
         ratio, chance = one.ratio or math.nan, one.probability if one.probability is not None else math.nan
-        rows.append([
-            (at, rooms.range_label(at)), (one.rms, f"{one.rms:.3g}"), (one.rms / ratio, f"{one.rms / ratio:.3g}"),
-            (ratio, f"{ratio:.2f}"), (chance, f"{chance:.2g}"),
-        ])  # fmt: skip
+        rows.append([at, one.rms, one.rms / ratio, ratio, chance])
     tell_table("against", Table(columns, rows))
     same = all(bool(one.same) for one in found)
     verdict = "agrees with" if same else "contradicts"

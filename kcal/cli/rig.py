@@ -18,7 +18,7 @@ import kcal.cli.rig_sources as rig_sources
 from kcal.cli import console, kinds, rooms
 from kcal.cli.console import aligned, err, out, print_label, print_styled, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_and_source, pixel_sigma_of
-from kcal.cli.options import Command, Kind, Only, Rare, Several, declared, group_with_default
+from kcal.cli.options import Kind, Only, Rare, Several
 from kcal.cli.report import NO, judged_rig, told_usable, warned_of
 from kcal.cli.rig_sources import Sources
 from kcal.errors import InputError
@@ -365,8 +365,6 @@ def place_command(
 
 # `kcal rig`.
 
-app = typer.Typer(cls=group_with_default("solve"), rich_markup_mode="markdown", help="Solve a rig, and check it later.")
-
 
 def solve_command(
     left: kinds.CalibratedCamera,
@@ -443,16 +441,13 @@ def solve_command(
     solve_and_write(paths, sources, options, output, needs=require or (), report=report, picture=picture)
 
 
-app.command("solve", hidden=True, cls=Command)(declared(solve_command))
-
-
 # Check whether the cameras of a rig have turned, and correct the rig file (`kcal rig check`).
 
 # The exit code of a rig that has turned, apart from errors (1) and wrong usage (2).
 DRIFTED = 3
 
 
-def check(
+def check_command(
     rig: kinds.RigFile,
     *,
     marks: kinds.Marks,
@@ -561,6 +556,3 @@ def replace_rig(path: Path, new: kcal.Rig) -> None:
         out.print(f"kept the old rig as {kept}")
     kcal.save_rig(new, path)
     print_wrote(path)
-
-
-app.command("check", cls=Command)(declared(check))

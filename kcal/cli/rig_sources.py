@@ -215,8 +215,6 @@ def _add_stars(read: RigReading, words: Sequence[str]) -> None:
     Raises:
         InputError: no images of one moment.
     """
-    import torch
-
     night, cameras, positions = read.given, read.cameras, read.positions
     given = images_by_camera("--stars", words, tuple(cameras))
     images = [_named_images(name, given[name], read) if name in given else [] for name in cameras]
@@ -229,9 +227,9 @@ def _add_stars(read: RigReading, words: Sequence[str]) -> None:
             "pairs are of one moment"
         )
     if on_earth and not read.placed and not positions:
-        there = torch.zeros(3, dtype=torch.float64)
+        there = rooms.torch.zeros(3, dtype=rooms.torch.float64)
         known = night.site.sigma if night.site and night.site.sigma is not None else _PLACE_SIGMA
-        positions = (kcal.MeasuredPosition(camera=0, point=there, sigma=torch.full_like(there, known)),)
+        positions = (kcal.MeasuredPosition(camera=0, point=there, sigma=rooms.torch.full_like(there, known)),)
     frame = read.origin if read.placed or positions else None
     source = kcal.stars.star_source(
         moments, list(cameras.values()), clock_sigma=night.clock_sigma, drift_sigma=night.clock_drift, origin=frame
@@ -322,8 +320,6 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
     Raises:
         InputError: no images, a camera without a place, and what `skyline_source` refuses.
     """
-    import torch
-
     given, names = read.given, list(read.cameras)
     words = given.skyline or given.scene
     if not words:
@@ -340,7 +336,7 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
             f"--skyline needs the place of {' and '.join(without) or 'each camera'} on the Earth: measure it (GNSS) "
             "and give --positions with latitudes and longitudes (or with local meters and --site)"
         )
-    centers, sigma = torch.zeros(len(names), 3).double(), torch.ones(len(names), 3).double()
+    centers, sigma = rooms.torch.zeros(len(names), 3).double(), rooms.torch.ones(len(names), 3).double()
     for number, position in places.items():
         centers[number], sigma[number] = position.point, position.sigma
     with steps("comparing skylines with the terrain", None):

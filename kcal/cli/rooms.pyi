@@ -1,12 +1,12 @@
 """What commands take of the rooms beside what kcal's doors name: where each name is defined."""
 
+import torch as torch
 from torch import Tensor as Tensor
 
 from kcal.bag import bag_and_topic as bag_and_topic
 from kcal.calibrate.batch.jobs import BatchOptions as BatchOptions
 from kcal.calibrate.batch.jobs import pieces as pieces
 from kcal.calibrate.batch.jobs import read_jobs as read_jobs
-from kcal.calibrate.batch.results import SummaryRow as SummaryRow
 from kcal.calibrate.batch.results import calibrate_batch as calibrate_batch
 from kcal.calibrate.camera.at_setting import camera_at_setting as camera_at_setting
 from kcal.calibrate.camera.checks import OutlierRejection as OutlierRejection
@@ -28,6 +28,7 @@ from kcal.calibrate.rig.pairs import read_pairs as read_pairs
 from kcal.calibrate.rig.result import RigResult as RigResult
 from kcal.capture.session import CaptureOptions as CaptureOptions
 from kcal.capture.session import CaptureSession as CaptureSession
+from kcal.capture.session import capture_app as capture_app
 from kcal.capture.session import follow as follow
 from kcal.capture.session import shots as shots
 from kcal.corners.detect import Detection as Detection
@@ -107,6 +108,7 @@ from kcal.locate.tabulate import true_from_grid as true_from_grid
 from kcal.mark.guide import Reference as Reference
 from kcal.mark.guide import open_pictures as open_pictures
 from kcal.mark.marking_service import Desk as Desk
+from kcal.mark.server import marking_app as marking_app
 from kcal.mark.session import Session as Session
 from kcal.pipeline.detections import load_detector as load_detector
 from kcal.pipeline.grouping import marks_of_lines as marks_of_lines

@@ -175,21 +175,17 @@ def view_command(
 
 def _rig_of(source: str) -> kcal.Rig:
     """A rig, or one camera alone as a rig of one."""
-    import torch
-
     if file_kind(source) == "rig":
         return kcal.load_rig(source)
     path, name = inputs.named_source(source)
     if name is None and file_kind(path) != "camera" and (found := kcal.lens.import_cameras(path)).is_rig():
         return found.rig()
     camera = inputs.single_camera(source)
-    return kcal.Rig([camera], [name or path.name.split(".")[0]], torch.eye(3)[None], torch.zeros(1, 3))
+    return kcal.Rig([camera], [name or path.name.split(".")[0]], rooms.torch.eye(3)[None], rooms.torch.zeros(1, 3))
 
 
 def _of_table(file: Path, kind: str, localize: kcal.Localizer, note: str) -> rooms.Located | kcal.rig.Survey:
     """Positions as they were written, marks or a detector's lines as they are located now, or landmarks."""
-    import torch
-
     locate = rooms.PointLocator(localize)
     lines = kind in ("foreign", "json")
     if not lines and "status" in rooms.header_of(file):
@@ -205,7 +201,7 @@ def _of_table(file: Path, kind: str, localize: kcal.Localizer, note: str) -> roo
             chunks = (marks for marks, _ in rooms.read_mark_chunks(file, names, single=single))
         locate = rooms.PointLocator(localize.weighing_all()) if single else locate
         parts, feet = zip(*map(locate, chunks), strict=True)
-        located = locate.located(rooms.PositionColumns.joined(parts), torch.cat(feet) if single else None)
+        located = locate.located(rooms.PositionColumns.joined(parts), rooms.torch.cat(feet) if single else None)
         if note:
             err.print(note)
     codes = located.columns.status.tolist()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
 from typing import Annotated
 
 import kcal
@@ -119,34 +121,26 @@ def _print_towers(now: rooms.SitingMap) -> None:
 
 
 def _ranked_table(ranked: list[rooms.RankedSite]) -> Table:
+    length = functools.partial(length_text, digits=3)
     columns = {
-        "name": "candidate", "order": "build", "heading_deg": "heading °", "mean_sigma_m": "alone",
-        "covered": "covered", "mean_sigma_after_m": "after",
+        "name": "candidate", "order": "build", "heading_deg": ("heading °", "{:.0f}"),
+        "mean_sigma_m": ("alone", length), "covered": ("covered", lambda share: f"{100 * share:.0f} %"),
+        "mean_sigma_after_m": ("after", length),
     }  # fmt: skip
-    rows = []
-    for one in ranked:
-        order, heading, after = one.order, one.site.heading_deg, one.after
-        rows.append([
-            one.site.name, None if order is None else (order, f"{order}"),
-            None if heading is None else (heading, f"{heading:.0f}"),
-            (one.mean_sigma, length_text(one.mean_sigma, digits=3)), (one.covered, f"{100 * one.covered:.0f} %"),
-            None if after is None else (after, length_text(after, digits=3)),
-        ])  # fmt: skip
+    rows = [[one.site.name, one.order, one.site.heading_deg, one.mean_sigma, one.covered, one.after] for one in ranked]
     return Table(columns, rows)
 
 
 def _map_text(area: rooms.Area, now: rooms.SitingMap, later: rooms.SitingMap | None) -> str:
     """One line for each point whose ground is known."""
-    import torch
-
-    columns = [*torch.meshgrid(area.lat, (area.lon + 180.0) % 360.0 - 180.0, indexing="ij"), area.ground]
+    columns = [*rooms.torch.meshgrid(area.lat, (area.lon + 180.0) % 360.0 - 180.0, indexing="ij"), area.ground]
     head, layout = ["lat", "lon", "height"], ["%.7f", "%.7f", "%.2f"]
     for found, word in ((now, ""), (later, "_after")):
         if found is not None:
             columns += [found.seen_by.double(), found.sigma]
             head, layout = [*head, f"seen_by{word}", f"sigma_m{word}"], [*layout, "%.0f", "%.4g"]
     form = ",".join(layout)
-    rows = torch.stack([column[area.known] for column in columns], -1).tolist()
+    rows = rooms.torch.stack([column[area.known] for column in columns], -1).tolist()
     return "\n".join([",".join(head), *(form % tuple(row) for row in rows)]) + "\n"
 
 
@@ -203,8 +197,6 @@ def budget_command(
         pitch: With --aperture: elevation of the cameras' axes.
         clock_sigma: With --aperture: standard deviation of the offset between the cameras' clocks.
     """
-    import math
-
     chosen = kcal.rig.planned_rig(focal_px=focal, baseline_m=baseline.value) if rig is None else rooms.load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, None if rig is None else chosen)
     disparity = math.sqrt(2.0) * noise

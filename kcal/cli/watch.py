@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import time as clocks
 from collections.abc import Iterator
@@ -82,7 +83,7 @@ def watch_command(
         if parquet.suffix.lower() != ".parquet":
             raise typer.BadParameter(f"--parquet {parquet}: a name that ends with .parquet is needed")
         with with_extra("tables", "Parquet files need"):
-            pass
+            importlib.import_module("pyarrow")
     if relock is not None:
         check_writable(relock, output)
     hooks = [rooms.Webhook(address) for address in alarm or [] if address != _EXIT]
@@ -128,9 +129,6 @@ def _follow(
     """Look until the sources end, it is stopped, or an alarm ends it."""
     frames, stopped = None, False
     if not Path(sources[0]).is_dir() or bag_and_topic(sources[0]) is not None:
-        with with_extra("video", "videos need"):
-            pass
-
         sizes = {"left": rig.left.size, "right": rig.right.size}
         frames = rooms.FramesTogether(sources, sizes, pairs=True, tell=lambda text: err.print(text))
 

@@ -45,8 +45,9 @@ def score_cameras(cameras: Mapping[str, Camera], truth: dict[str, Any]) -> Table
         InputError: images of another size.
     """
     columns = {
-        "camera": "camera", "rms_px": "RMS px", "middle_px": "middle px", "largest_px": "largest px",
-        "sideways_m": "sideways at 5 km", "range_m": "range at 5 km",
+        "camera": "camera", "rms_px": ("RMS px", "{:.3f}"), "middle_px": ("middle px", "{:.3f}"),
+        "largest_px": ("largest px", "{:.3f}"), "sideways_m": ("sideways at 5 km", "{:.2f} m"),
+        "range_m": ("range at 5 km", "{:.0f} m"),
     }  # fmt: skip
     rows: list[list[Any]] = []
     for side, camera in cameras.items():
@@ -54,8 +55,7 @@ def score_cameras(cameras: Mapping[str, Camera], truth: dict[str, Any]) -> Table
         found = off.isfinite()
         rms, middle = (float(off[some].square().mean().sqrt()) for some in (found, found & central))
         sideways, along = rms / focal * _FAR, rms * _FAR**2 / (focal * truth["baseline_m"])
-        pixels = [(value, f"{value:.3f}") for value in (rms, middle, float(off[found].max()))]
-        rows.append([side, *pixels, (sideways, f"{sideways:.2f} m"), (along, f"{along:.0f} m")])
+        rows.append([side, rms, middle, float(off[found].max()), sideways, along])
     return Table(columns, rows)
 
 
@@ -81,17 +81,19 @@ def score_rig(rig: Rig, truth: dict[str, Any]) -> Table:
     if rig.mounting is None:
         rig = rig.placed(origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0)
     localize = Localizer(rig, pixel_sigma=_EXACT)
-    columns = {"range_m": "at", "mean_m": "mean m", "rms_m": "RMS m", "stated_m": "one sigma as stated m"}
+    columns = {
+        "range_m": ("at", lambda far: f"{far / 1000:g} km"), "mean_m": ("mean m", _signed), "rms_m": ("RMS m", _meters),
+        "stated_m": ("one sigma as stated m", _meters),
+    }  # fmt: skip
     rows: list[list[Any]] = []
     for pairs in truth["pairs"]:
         left, right = (torch.tensor(pairs[side], dtype=torch.float64) for side in ("left", "right"))
         off = torch.linalg.vector_norm(localize(left, right).enu, dim=-1) - pairs["range_m"]
         off = off[off.isfinite()]
-        stated: tuple[float | None, str] = (None, "none")
+        stated: Any = (None, "none")
         if rig.covariance is not None:
-            stated = _meters(float(range_sigmas(rig, [pairs["range_m"]], pixel_sigma=_EXACT).total[0]))
-        mean, rms = float(off.mean()), float(off.square().mean().sqrt())
-        rows.append([(pairs["range_m"], f"{pairs['range_m'] / 1000:g} km"), _signed(mean), _meters(rms), stated])
+            stated = float(range_sigmas(rig, [pairs["range_m"]], pixel_sigma=_EXACT).total[0])
+        rows.append([pairs["range_m"], float(off.mean()), float(off.square().mean().sqrt()), stated])
     return Table(columns, rows)
 
 
@@ -99,16 +101,15 @@ def score_positions(path: Path, truth: dict[str, Any]) -> Table:
     """Positions of a file against the true ones of the same names: on the map, in range, and by their intervals."""
     true = {name.casefold(): np.array(place) for name, place in truth["targets"].items()}
     columns = {
-        "target": "target", "range_m": "range m", "level_m": "off on the map m", "range_off_m": "off in range m",
-        "contains": "95 % interval contains it",
+        "target": "target", "range_m": ("range m", "{:.0f}"), "level_m": ("off on the map m", _meters),
+        "range_off_m": ("off in range m", _signed),
+        "contains": ("95 % interval contains it", lambda inside: "yes" if inside else "no"),
     }  # fmt: skip
     rows: list[list[Any]] = []
     for row in located_rows(path, truth):
         if (place := true.get(row.name.strip().casefold())) is not None:
-            far, level, off, inside = row.against(place)
-            answer = inside, "yes" if inside else "no"
-            rows.append([row.name, (far, f"{far:.0f}"), _meters(level), _signed(off), answer])
-    rows.sort(key=lambda row: float(row[1][0]))
+            rows.append([row.name, *row.against(place)])
+    rows.sort(key=lambda row: float(row[1]))
     return Table(columns, rows)
 
 
@@ -138,8 +139,9 @@ def score_tracks(path: Path, truth: dict[str, Any]) -> tuple[Table, int]:
         else:
             own[nearest] += each[nearest]
     columns = {
-        "ship": "ship", "range_m": "range m", "followed": "followed", "tracks": "tracks", "level_m": "off on the map m",
-        "range_off_m": "off in range m", "contained": "intervals with the truth",
+        "ship": "ship", "range_m": ("range m", "{:.0f}"), "followed": ("followed", _percent), "tracks": "tracks",
+        "level_m": ("off on the map m", _meters), "range_off_m": ("off in range m", _meters),
+        "contained": ("intervals with the truth", _percent),
     }  # fmt: skip
     found: list[list[Any]] = []
     for ship, some in own.items():
@@ -147,12 +149,8 @@ def score_tracks(path: Path, truth: dict[str, Any]) -> tuple[Table, int]:
         names, moments, _, levels, offs, inside = zip(*some, strict=True) if some else [()] * 6
         level, off = ((float(np.median(np.abs(each))) if each else math.nan) for each in (levels, offs))
         share, contained = len(set(moments)) / len(times), float(np.mean(inside)) if inside else math.nan
-        count = len(set(names))
-        found.append([
-            ship, (far, f"{far:.0f}"), (share, f"{100 * share:.0f} %"), (count, f"{count}"), _meters(level),
-            _meters(off), (contained, "" if math.isnan(contained) else f"{100 * contained:.0f} %"),
-        ])  # fmt: skip
-    found.sort(key=lambda row: float(row[1][0]))
+        found.append([ship, far, share, len(set(names)), level, off, contained])
+    found.sort(key=lambda row: float(row[1]))
     return Table(columns, found), strays
 
 
@@ -160,15 +158,18 @@ def _place_at(places: Floats, times: Floats, time: float) -> Floats:
     return np.array([np.interp(time, times, column) for column in places.T])
 
 
-def _meters(value: float) -> tuple[float, str]:
-    """A cell."""
+def _meters(value: float) -> str:
     if math.isnan(value):
-        return value, ""
-    return value, f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}" if abs(value) >= 0.01 else f"{value:.3f}"
+        return ""
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}" if abs(value) >= 0.01 else f"{value:.3f}"
 
 
-def _signed(value: float) -> tuple[float, str]:
-    return value, f"{'-' if value < 0 else '+'}{_meters(abs(value))[1]}"
+def _signed(value: float) -> str:
+    return f"{'-' if value < 0 else '+'}{_meters(abs(value))}"
+
+
+def _percent(share: float) -> str:
+    return "" if math.isnan(share) else f"{100 * share:.0f} %"
 
 
 class PositionRow(NamedTuple):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ast
+import sys
 from pathlib import Path
 
 import pytest
 
 from kcal.cli import rooms
 from kcal.doors import named_modules
+from kcal.errors import InputError
 from kcal.locate.marks import is_long
 
 
@@ -23,3 +25,18 @@ def test_a_name_is_what_its_module_defines() -> None:
     assert rooms.is_long is is_long
     with pytest.raises(AttributeError, match="no attribute 'is_short'"):
         _ = rooms.is_short  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("name", "library", "extra"),
+    [("Videos", "av", "video"), ("sender_to", "starlette", "mark"), ("LocalServer", "uvicorn", "mark")],
+)
+def test_a_library_that_is_missing_is_named_with_its_extra(
+    name: str, library: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for loaded in [one for one in sys.modules if one.partition(".")[0] == library]:
+        monkeypatch.setitem(sys.modules, loaded, None)
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, named_modules(rooms.__file__)[name], raising=False)
+    with pytest.raises(InputError, match=rf"this needs {library}\S*; install it with: pip install 'kcal\[{extra}\]'"):
+        getattr(rooms, name)
