@@ -15,7 +15,7 @@ from kcal.cli.console import err, out, print_styled, print_table, print_wrote, s
 from kcal.cli.inputs import BOARD, check_file, pixel_sigma_of, single_camera
 from kcal.cli.options import Kind, Rare, Several
 from kcal.cli.report import NO, judged, told_usable
-from kcal.cli.stars import by_night, joined_by_stars
+from kcal.cli.stars import Night, by_night, joined_by_stars
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_picture, check_writable, make_folder
 from kcal.table import Table
@@ -214,14 +214,14 @@ def calibrate_command(
         loss: Robust loss against wrong corners: huber, cauchy or tukey.
         loss_scale: Residual at which the robust loss sets in.
     """
-    count, settings = len(obs or [output]), setting or {}
+    count, settings, night = len(obs or [output]), setting or {}, Night(time=time, site=site)
     for key, numbers in settings.items():
         if len(numbers) not in (1, count):
             raise InputError(f"--setting {key}: {len(numbers)} numbers for {count} cameras; give one, or one for each")
     if obs is None and settings:
         raise InputError("--setting: cameras of stars alone do not keep it; give observations of a board as well")
     if not obs:
-        by_night(stars, time, site, output, name)
+        by_night(stars, night, output, name)
         return
     if stars and len(obs) > 1:
         raise InputError("--stars are of one camera: calibrate each with its own boards and night images")
@@ -266,7 +266,7 @@ def calibrate_command(
             with console.ending_with(lambda error: cure(error, 0)):
                 outcomes = [kcal.calibrate_camera(sets[0], options, advance)]
     if stars and not isinstance(outcomes[0], KcalError):
-        outcomes = [joined_by_stars(outcomes[0], stars, time, site, places[0].output)]
+        outcomes = [joined_by_stars(outcomes[0], stars, night, places[0].output)]
     failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
     usable = True
     figures: dict[str, dict[str, Any]] = {}

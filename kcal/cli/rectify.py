@@ -372,7 +372,7 @@ def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.NewFil
     The file has `rays` (C, H, W, 6) in float32, as gsplat takes them from version 1.6 on: origin, in meters, and
     direction of each pixel's ray. The origin lies on the camera's axis; for a lens with an entrance pupil that moves it
     is not the same for all pixels. Also `mask` (C, H, W), `viewmats` (C, 4, 4) and `Ks` (C, 3, 3). Rays of single
-    cameras are in the camera's frame, those of a rig in the left camera's. Pixels without a ray have zeros.
+    cameras are in the camera's frame, those of a rig in its first one's. Pixels without a ray have zeros.
 
     **Examples**
 
@@ -391,10 +391,11 @@ def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.NewFil
     import torch
 
     rig = rig_of(sources[0]) if len(sources) == 1 else None
-    cameras = [single_camera(source) for source in sources] if rig is None else [rig.left, rig.right]
+    cameras = [single_camera(source) for source in sources] if rig is None else rig.each
     viewmats = torch.eye(4, dtype=torch.float64).repeat(len(cameras), 1, 1)
     if rig is not None:
-        viewmats[1, :3, :3], viewmats[1, :3, 3] = rig.right_from_left_rotation, rig.right_from_left_translation
+        viewmats[:, :3, :3] = turn = rig.rotation @ rig.rotation[0].T
+        viewmats[:, :3, 3] = rig.translation - turn @ rig.translation[0]
     with steps("rays", 2) as advance:
         module = kcal.lens.CameraRays(cameras)
         advance("rounding")

@@ -124,19 +124,18 @@ _PARTS = 3
 _FEW_IN_A_PART = 3
 
 
-def by_night(images: list[str] | None, time: str | None, site: kcal.Origin | None, output: Path, name: str) -> None:
+def by_night(images: list[str] | None, night: Night, output: Path, name: str) -> None:
     """Calibrate a camera from the stars of night images alone, and write it.
 
     Args:
         images: files, folders and wildcards.
-        time: as `--time`.
-        site: where the camera stands, for refraction.
+        night: when and where they were taken.
         output: camera file.
         name: of the camera.
     """
     if not images:
         raise InputError("give observations of a board (from `kcal detect`), or night images with --stars")
-    found = _by_stars(images, time, site, output)
+    found = _by_stars(images, night, output)
     camera = found.lens.camera
     if camera.calibration is not None and name:
         camera.calibration = dataclasses.replace(camera.calibration, name=name)
@@ -146,10 +145,10 @@ def by_night(images: list[str] | None, time: str | None, site: kcal.Origin | Non
 
 
 def joined_by_stars(
-    boards: rooms.CameraCalibrationResult, images: list[str], time: str | None, site: kcal.Origin | None, output: Path
+    boards: rooms.CameraCalibrationResult, images: list[str], night: Night, output: Path
 ) -> rooms.CameraCalibrationResult:
     """The calibration by boards, refined by stars. Other arguments as of `by_night`."""
-    found = _by_stars(images, time, site, output, boards)
+    found = _by_stars(images, night, output, boards)
     agreement, joint = found.agreement, found.joint
     assert agreement is not None
     assert joint is not None
@@ -162,18 +161,14 @@ def joined_by_stars(
 
 
 def _by_stars(
-    images: list[str],
-    time: str | None,
-    site: kcal.Origin | None,
-    output: Path,
-    boards: rooms.CameraCalibrationResult | None = None,
+    images: list[str], night: Night, output: Path, boards: rooms.CameraCalibrationResult | None = None
 ) -> rooms.StarCamera:
     """Read the images, calibrate, and tell what was found."""
-    if site is not None and time is None:
+    if night.site is not None and night.time is None:
         raise InputError("--site without --time tells nothing: refraction depends on both")
     files = rooms.expand_nights(images)
     check_writable(output, *files)
-    views = [Night(time=time, site=site).view(path) for path in files]
+    views = [night.view(path) for path in files]
     found, size = camera_by_stars(files, views, "calibrating by stars", boards)
     count = sum(int(use.sum()) for use in found.lens.used)
     left_out = sum(len(use) for use in found.lens.used) - count
@@ -191,7 +186,7 @@ def _by_stars(
     print_styled(text, r"(?<=; RMS )\S+ px")
     warn(*(f"{files[number].name}: {why}" for number, why in found.refused.items()))
     warn(*sparse_parts(found, size))
-    if site is None:
+    if night.site is None:
         warn(
             "without --time and --site refraction stays in the lens: it shrinks heights by 0.03 % overhead, 0.12 % at "
             "30° of altitude and 1 % at 10°; give both"
