@@ -123,15 +123,15 @@ def calibrate_command(
     *,
     output: kinds.Output,
     stars: Several[Annotated[str, Kind(metavar="IMAGES")]] | None = None,
-    time: Rare[Annotated[str | None, Kind(metavar="TIME")]] = None,
-    site: Rare[kinds.Site | None] = None,
+    time: Rare[Annotated[str | None, Kind(metavar="TIME", of="stars")]] = None,
+    site: Rare[Annotated[kinds.Site, Kind(of="stars")] | None] = None,
     picture: Path | None = None,
     verbose: Rare[bool] = False,
     board_shape: Annotated[str, Kind(metavar="KIND")] = "printed",
     without: Rare[Annotated[list[str] | None, Kind(metavar="KIND")]] = None,
     one_type: bool = False,
     reject: bool = False,
-    reject_limit: Rare[Annotated[float, Kind(metavar="SHARE")]] = 0.1,
+    reject_limit: Rare[Annotated[float, Kind(metavar="SHARE", of="reject")]] = 0.1,
     temperature: Rare[kinds.Celsius] | None = None,
     setting: kinds.Settings | None = None,
     name: Rare[str] = "",
@@ -150,7 +150,7 @@ def calibrate_command(
     weak_prior: _Parametric[Annotated[float, Kind(metavar="SHARE", least=0)]] = 0.3,
     camera: _Parametric[kinds.CameraFile] | None = None,
     loss: _Parametric[Annotated[str | None, Kind(metavar="KIND")]] = None,
-    loss_scale: _Parametric[kinds.Pixels] = 1.0,
+    loss_scale: _Parametric[Annotated[kinds.Pixels, Kind(of="loss")]] = 1.0,
 ) -> None:
     """Calibrate a camera, or several: intrinsics, lens and error bars.
 

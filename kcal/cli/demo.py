@@ -35,10 +35,10 @@ def demo_command(
     practice: Annotated[Path | None, Kind(metavar="FOLDER")] = None,
     score: Annotated[Path | None, Kind(metavar="FOLDER")] = None,
     images: Path | None = None,
-    board: Annotated[str, Kind(metavar="CxR")] = "9x6",
-    square: Annotated[str, Kind(metavar="LENGTH")] = "25mm",
-    site: kinds.Place | None = None,
-    heading: kinds.Degrees = 0.0,
+    board: Annotated[str, Kind(metavar="CxR", of="images")] = "9x6",
+    square: Annotated[str, Kind(metavar="LENGTH", of="images")] = "25mm",
+    site: Annotated[kinds.Place, Kind(of="images")] | None = None,
+    heading: Annotated[kinds.Degrees, Kind(of="images")] = 0.0,
 ) -> None:
     """Run the main job from images to positions, and compare the result with the truth.
 

@@ -97,7 +97,7 @@ def import_command(
     size: kinds.Size | None = None,
     fisheye: bool | None = None,
     board: kinds.Inner | None = None,
-    square: kinds.Side | None = None,
+    square: Annotated[kinds.Side, Kind(of="board")] | None = None,
     survey_sigma: kinds.Sigma | None = None,
     geoid: kinds.Meters | None = None,
     unit: kinds.Unit | None = None,

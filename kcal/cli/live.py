@@ -34,7 +34,7 @@ def live_command(
     journal: Rare[Path | None] = None,
     options: Annotated[LocateOptions, Only(("site", "heading", "pixel_sigma", "history"))],
     box_sigma: Rare[kinds.Pixels] = 2.0,
-    match_sigma: Rare[kinds.Pixels] = 0.06,
+    match_sigma: Rare[Annotated[kinds.Pixels, Kind(of="videos")]] = 0.06,
     clock_offset: Rare[kinds.Clock] = 0.0,
     clock_sigma: kinds.Seconds = 0.0,
     compile: Rare[bool] = False,

@@ -107,8 +107,8 @@ class LocateOptions:
     refraction: Rare[kinds.MeasuredRefraction | None] = None
     height: kinds.Height | None = None
     terrain: Rare[kinds.Raster | None] = None
-    terrain_sigma: Rare[Annotated[float, Kind(metavar="M", least=0.01)]] = 3.0
-    geoid: Rare[kinds.Meters] = 0.0
+    terrain_sigma: Rare[Annotated[float, Kind(metavar="M", least=0.01, of="terrain")]] = 3.0
+    geoid: Annotated[Rare[kinds.Meters], Kind(of="terrain")] = 0.0
     geoid_grid: Rare[Path | None] = None
 
     def __post_init__(self) -> None:
@@ -219,9 +219,9 @@ def locate_command(
     format: Rare[Annotated[str, Kind(metavar="NAME")]] = "csv",
     picture: kinds.Picture | None = None,
     map_: Annotated[Path, Kind(writes=True)] | None = None,
-    tiles: Rare[Annotated[Path, Kind(metavar="FOLDER")] | None] = None,
-    image: Rare[Annotated[Path, Kind(metavar="TIF")] | None] = None,
-    online: Rare[bool] = False,
+    tiles: Rare[Annotated[Path, Kind(metavar="FOLDER", of="map_")] | None] = None,
+    image: Rare[Annotated[Path, Kind(metavar="TIF", of="map_")] | None] = None,
+    online: Annotated[Rare[bool], Kind(of="map_")] = False,
 ) -> None:
     """Locate points that were marked in both images: latitude, longitude, height and a 95 % range interval.
 

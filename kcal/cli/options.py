@@ -159,6 +159,7 @@ class Kind:
         setting: whether kcal.toml may give it.
         writes: whether it names a file to write: that is refused at once where it cannot be written, or is a file that
             another option names.
+        of: name of the option without which this one does nothing, which is said.
         panel: title of the box in the help.
         about: what it is; `{}` stands for what `Args:` say of the one option.
     """
@@ -173,6 +174,7 @@ class Kind:
     rare: bool = False
     setting: bool = False
     writes: bool = False
+    of: str = ""
     panel: str | None = None
     about: str = "{}"
 
@@ -353,6 +355,7 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
     signature = inspect.signature(function, eval_str=True)
     text, about = described(function.__doc__)
     options = list(_declared_options([*signature.parameters.values()], about))
+    labels = {one.name: one.label for one in options}
     names = [name for name in signature.parameters if name in {one.group for one in options}]
     groups = {name: _taken_apart(signature.parameters[name].annotation)[0] for name in names}
 
@@ -363,6 +366,10 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
         for path in (path for one in options if one.kind.writes for path in given_texts(given[one.name])):
             if path != "-":
                 check_writable(path, *others)
+        for one in options:
+            idle = one.kind.of and not given[one.kind.of] and one.name not in taken
+            if idle and given[one.name] not in (None, [], one.parameter.default):
+                console.warn(f"{one.label} does nothing without {labels[one.kind.of]}")
         check_given([(one.label, one.wanted, given[one.name]) for one in options if one.wanted is not None])
         read: dict[str | None, dict[str, Any]] = {None: {}, **{name: {} for name in groups}}
         for one in options:

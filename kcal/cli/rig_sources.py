@@ -71,7 +71,7 @@ class Sources:
     """
 
     pairs: Several[kinds.Observed] | None = None
-    match: Rare[kinds.Table | None] = None
+    match: Rare[Annotated[kinds.Table, Kind(of="pairs")] | None] = None
     landmarks: kinds.Survey | None = None
     marks: kinds.Marks | None = None
     features: Rare[kinds.Marks | None] = None
@@ -84,16 +84,16 @@ class Sources:
     scene: Annotated[Several[str], Kind(metavar="LEFT RIGHT")] | None = None
     skyline: Rare[Annotated[Several[str], Kind(metavar="IMAGES")] | None] = None
     terrain: Rare[kinds.Raster | None] = None
-    terrain_sigma: Rare[kinds.Sigma | None] = None
+    terrain_sigma: Rare[Annotated[kinds.Sigma, Kind(of="terrain")] | None] = None
     skyline_picture: Rare[kinds.Picture | None] = None
     tracks: Rare[Annotated[tuple[kinds.Table, kinds.Table], Kind(metavar="TRACKS.csv SIGHTINGS.csv")] | None] = None
-    tracks_clock: Rare[kinds.Seconds] = 2.0
-    time: Rare[kinds.Times | None] = None
+    tracks_clock: Rare[Annotated[kinds.Seconds, Kind(of="tracks")]] = 2.0
+    time: Rare[Annotated[kinds.Times, Kind(of="stars")] | None] = None
     clock_sigma: Rare[kinds.Seconds] = 0.1
-    clock_drift: Rare[kinds.Seconds] = 0.05
-    temperature: Rare[kinds.Celsius | None] = None
-    pressure: Rare[kinds.Hectopascal | None] = None
-    dut1: Rare[kinds.Clock | None] = None
+    clock_drift: Rare[Annotated[kinds.Seconds, Kind(of="stars")]] = 0.05
+    temperature: Rare[Annotated[kinds.Celsius, Kind(of="stars")] | None] = None
+    pressure: Rare[Annotated[kinds.Hectopascal, Kind(of="stars")] | None] = None
+    dut1: Rare[Annotated[kinds.Clock, Kind(of="stars")] | None] = None
     refraction: Rare[kinds.MeasuredRefraction] = _REFRACTION
     pixel_sigma: kinds.PixelSigma | None = None
 

@@ -26,9 +26,9 @@ def sites_command(
     *,
     area: kinds.Area,
     candidates: kinds.Sites | None = None,
-    build: kinds.Count = 1,
+    build: Annotated[kinds.Count, Kind(of="candidates")] = 1,
     terrain: kinds.Raster | None = None,
-    geoid: kinds.Meters = 0.0,
+    geoid: Annotated[kinds.Meters, Kind(of="terrain")] = 0.0,
     ground: kinds.Meters | None = None,
     above: kinds.Meters = 0.0,
     cells: Annotated[int, Kind(metavar="N", least=10)] = 200,
@@ -162,8 +162,8 @@ def budget_command(
     speed: Annotated[float, Kind(metavar="M/S", least=0)] = 20.0,
     picture: kinds.Picture | None = None,
     aperture: kinds.Millimeters | None = None,
-    pitch: kinds.Degrees = 0.0,
-    clock_sigma: kinds.Seconds = 0.01,
+    pitch: Annotated[kinds.Degrees, Kind(of="aperture")] = 0.0,
+    clock_sigma: Annotated[kinds.Seconds, Kind(of="aperture")] = 0.01,
 ) -> None:
     """Print range errors from disparity, relative yaw, baseline and timing, each alone, at several ranges.
 

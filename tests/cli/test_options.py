@@ -11,7 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from kcal.cli import kinds
-from kcal.cli.options import Command, Only, Rare, Several, declared
+from kcal.cli.options import Command, Kind, Only, Rare, Several, declared
 from kcal.errors import FileError, InputError
 from kcal.values import (
     WithSigma,
@@ -50,7 +50,7 @@ def show(
     *,
     shared: kinds.Annotated[Shared, Only(("limit", "stars"))],
     heading: kinds.MeasuredDegrees = WithSigma(1.0, 0.5),
-    site: Rare[kinds.Place | None] = None,
+    site: Rare[kinds.Annotated[kinds.Place, Kind(of="keep")] | None] = None,
     keep: bool = False,
     pixel_sigma: kinds.PixelSigma | None = None,
 ) -> None:
@@ -110,6 +110,11 @@ def test_wrong_words_are_wrong_usage_and_wrong_values_are_not() -> None:
         run("a", "--site", "1,2")
     with pytest.raises(FileError, match=r"none\.json: cannot read"):
         run("a", "none.json")
+
+
+def test_an_option_that_does_nothing_is_said() -> None:
+    for words, said in ((["--keep"], ""), ([], "warning: --site does nothing without --keep\n")):
+        assert CliRunner().invoke(app, ["show", "a", "--site", "1,2,3", *words]).stderr == said
 
 
 def test_a_file_is_checked_before_values_are_read(tmp_path: Path) -> None:
