@@ -19,7 +19,7 @@ from kcal.errors import InputError
 from kcal.files import check_writable, is_stream, make_folder, source_name, write_atomic
 
 
-def print_command(
+def board_print_command(
     *,
     board: kinds.Board,
     output: kinds.NewFile,
@@ -67,7 +67,7 @@ def print_command(
         out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
 
 
-def measure_command(
+def board_measure_command(
     observations: list[kinds.Observed], *, output: kinds.NewFile, picture: kinds.Picture | None = None
 ) -> None:
     """Measure a printed board: how it bends, and how its print errs, each with its σ.

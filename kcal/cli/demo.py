@@ -21,7 +21,7 @@ from kcal.cli.console import out, print_label, print_styled, print_table, steps
 from kcal.cli.locate import locate_command
 from kcal.cli.options import Command, Kind, declared
 from kcal.cli.report import report_command
-from kcal.cli.rig import solve_command
+from kcal.cli.rig import rig_solve_command
 from kcal.errors import FileError
 from kcal.files import make_folder, write_atomic
 from kcal.texts import length_text
@@ -132,7 +132,7 @@ def _residuals_text(file: rooms.RigFile) -> str:
 # Steps that both demonstrations share: run a command, locate the points, list the results.
 
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "detect": detect_command, "calibrate": calibrate_command, "rig": solve_command, "locate": locate_command,
+    "detect": detect_command, "calibrate": calibrate_command, "rig": rig_solve_command, "locate": locate_command,
     "report": report_command,
 }  # fmt: skip
 

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, TypeAlias
 
 import typer
 
@@ -20,13 +20,8 @@ from kcal.files import written_files
 from kcal.texts import one_line
 
 
-class LocatedPart(NamedTuple):
-    """Positions; where bearings count from, of several cameras; whether the table states noise; how far it is read."""
-
-    columns: rooms.PositionColumns
-    feet: rooms.Tensor | None
-    stated: bool
-    read: int
+# Positions; where bearings count from, of several cameras; whether the table states noise; how far it is read.
+LocatedPart: TypeAlias = "tuple[rooms.PositionColumns, rooms.Tensor | None, bool, int]"
 
 
 # What `kcal locate` prints and draws of positions.
@@ -158,7 +153,7 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[rooms.Point
     def parts() -> Iterator[LocatedPart]:
         for marks, read in rooms.read_mark_chunks(points, solved.names, single=many):
             columns, feet = (by_moments or locate)(marks)
-            yield LocatedPart(columns, feet, marks.covariance_or(noise) is not None, read)
+            yield columns, feet, marks.covariance_or(noise) is not None, read
 
     return locate, parts(), note
 

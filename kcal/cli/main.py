@@ -115,7 +115,7 @@ for group, (default, about) in GROUPS.items():
     app.add_typer(groups[group], name=group)
 for words, module in COMMANDS.items():
     group, _, name = words.rpartition(" ")
-    function = getattr(importlib.import_module(f"kcal.cli.{module}"), f"{name}_command")
+    function = getattr(importlib.import_module(f"kcal.cli.{module}"), f"{words.replace(' ', '_')}_command")
     run = declared(function, json=name not in WITHOUT_JSON)
     groups[group].command(name, cls=Command, hidden=words == "rig solve")(run)
 

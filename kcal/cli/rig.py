@@ -366,7 +366,7 @@ def place_command(
 # `kcal rig`.
 
 
-def solve_command(
+def rig_solve_command(
     left: kinds.CalibratedCamera,
     right: kinds.CalibratedCamera,
     others: list[kinds.CalibratedCamera] | None = None,
@@ -447,7 +447,7 @@ def solve_command(
 DRIFTED = 3
 
 
-def check_command(
+def rig_check_command(
     rig: kinds.RigFile,
     *,
     marks: kinds.Marks,

@@ -139,9 +139,9 @@ def score_tracks(path: Path, truth: dict[str, Any]) -> tuple[Table, int]:
         else:
             own[nearest] += each[nearest]
     columns = {
-        "ship": "ship", "range_m": ("range m", "{:.0f}"), "followed": ("followed", _percent), "tracks": "tracks",
+        "ship": "ship", "range_m": ("range m", "{:.0f}"), "followed": ("followed", _shares), "tracks": "tracks",
         "level_m": ("off on the map m", _meters), "range_off_m": ("off in range m", _meters),
-        "contained": ("intervals with the truth", _percent),
+        "contained": ("intervals with the truth", _shares),
     }  # fmt: skip
     found: list[list[Any]] = []
     for ship, some in own.items():
@@ -168,7 +168,7 @@ def _signed(value: float) -> str:
     return f"{'-' if value < 0 else '+'}{_meters(abs(value))}"
 
 
-def _percent(share: float) -> str:
+def _shares(share: float) -> str:
     return "" if math.isnan(share) else f"{100 * share:.0f} %"
 
 

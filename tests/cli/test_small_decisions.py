@@ -36,12 +36,12 @@ CAMERAS = [
     (0.0004, "0.000"), (-0.25, "-0.25"), (math.nan, ""),
 ])  # fmt: skip
 def test_meters(value: float, text: str) -> None:
-    assert _meters(value)[1] == text
+    assert _meters(value) == text
 
 
 @pytest.mark.parametrize(("value", "text"), [(12.4, "+12"), (-12.4, "-12"), (-0.5, "-0.5"), (0.0, "+0.000")])
 def test_errors_have_their_sign(value: float, text: str) -> None:
-    assert _signed(value) == (value, text)
+    assert _signed(value) == text
 
 
 def test_the_first_result_that_is_there(tmp_path: Path) -> None:
