@@ -19,7 +19,6 @@ from kcal.errors import DegenerateError, InputError
 from kcal.files import written_files
 from kcal.texts import one_line
 
-
 # Positions; where bearings count from, of several cameras; whether the table states noise; how far it is read.
 LocatedPart: TypeAlias = "tuple[rooms.PositionColumns, rooms.Tensor | None, bool, int]"
 
