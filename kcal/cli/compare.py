@@ -114,9 +114,10 @@ def diff_command(
         picture: maps of the difference and of its σ.
     """
     cameras = [single_camera(source) for source in (first, second)]
-    then, now = (_temperature(camera) for camera in cameras)
-    for source, camera in zip((first, second), cameras, strict=True):
-        out.print(f"{source}: {_history(camera)}")
+    records = [camera.calibration.record if camera.calibration else None for camera in cameras]
+    then, now = (record.temperature if record else None for record in records)
+    for source, camera, record in zip((first, second), cameras, records, strict=True):
+        out.print(f"{source}: {_history(camera, record)}")
     found = kcal.lens.camera_difference(*cameras, at=distance, rotation=None if turn else rooms.torch.eye(3))
     tell(
         at_m=None if math.isinf(distance) else distance,
@@ -136,14 +137,8 @@ def diff_command(
         print_wrote(kcal.report.save_picture(picture, rooms.difference_figure(found, title=f"{first} and {second}")))
 
 
-def _temperature(camera: kcal.Camera) -> float | None:
-    record = camera.calibration.record if camera.calibration else None
-    return record.temperature if record else None
-
-
-def _history(camera: kcal.Camera) -> str:
+def _history(camera: kcal.Camera, record: rooms.CalibrationRecord | None) -> str:
     """Model, focal length and, if the file tells, when the camera was calibrated."""
-    record = camera.calibration.record if camera.calibration else None
     when = ""
     if record:
         when = f", {record.created:%Y-%m-%d %H:%M}, RMS {number_text(record.rms)} px from {record.views} views"

@@ -154,9 +154,7 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
 def check_folder(folder: Path, seed: int) -> None:
     """Raise `FileError` unless a site of the seed may be written here: nothing, or a part of that very site."""
     if (folder / TRUTH).exists():
-        truth = read_truth_file(folder)
-        own = truth.get("seed")
-        if own != seed:
+        if (own := read_truth_file(folder).get("seed")) != seed:
             raise FileError(f"{folder}: here is the site of seed {own}; give --seed {own} or another folder")
     elif folder.is_dir() and any(folder.iterdir()):
         raise FileError(f"{folder}: this folder has other files; name one that is empty or does not exist yet")

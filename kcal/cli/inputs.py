@@ -148,9 +148,7 @@ _STATION = (
     "pose that you know: kcal place), then kcal locate {name}.rig.json {marks}, with --height 12±3 or --terrain "
     "dem.tif for positions"
 )
-CAMERA_OR_RIG = dataclasses.replace(
-    ANY_CAMERA, words="a camera or rig file", kinds=frozenset({"camera", "rig", "bag", "foreign", "json", "unknown"})
-)
+CAMERA_OR_RIG = dataclasses.replace(ANY_CAMERA, words="a camera or rig file", kinds=ANY_CAMERA.kinds - {"table"})
 OBSERVATIONS = Wanted(
     "a kcal observations file",
     frozenset({"observations"}),
@@ -197,9 +195,7 @@ VIEWED = dataclasses.replace(
 )
 FOREIGN = Wanted(
     "a file of another program",
-    frozenset(
-        {"camera", "rig", "bag", "foreign", "json", "image", "unknown", "table", "survey", "marks", "geojson", "gpx"}
-    ),
+    ANY_CAMERA.kinds | {"image", "survey", "marks", "geojson", "gpx"},
     "kcal import left.yaml -o left.camera.json",
     (("observations", _CALIBRATE),),
     part=True,

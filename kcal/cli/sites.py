@@ -66,11 +66,7 @@ def sites_command(
     """
     if (terrain is None) == (ground is None):
         raise InputError("give --terrain, or --ground with the height of level ground above the ellipsoid; one of them")
-    surface = (
-        kcal.locate.level_ground(ground)
-        if terrain is None and ground is not None
-        else kcal.locate.terrain(terrain or "", geoid)
-    )
+    surface = kcal.locate.level_ground(ground or 0.0) if terrain is None else kcal.locate.terrain(terrain, geoid)
     if file_kind(towers) == "rig":
         rig = rooms.stations_of(kcal.load_rig(towers))
         standing = rooms.sites_of(rig, pixel_sigma_of(pixel_sigma, rig))

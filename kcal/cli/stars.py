@@ -34,8 +34,8 @@ class Night:
     site: kinds.Site | None = None
     dut1: kinds.Clock | None = None
     time_sigma: kinds.Seconds = 0.1
-    temperature: kinds.Celsius | None = None
-    pressure: kinds.Hectopascal | None = None
+    temperature: Annotated[kinds.Celsius, Kind(of="site")] | None = None
+    pressure: Annotated[kinds.Hectopascal, Kind(of="site")] | None = None
 
     def view(self, path: Path) -> kcal.stars.SkyView:
         """Of one image."""
