@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 from kcal.texts import csv_line
+
+Columns: TypeAlias = Mapping[str, str | tuple[str, str | Callable[[Any], str]]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +30,7 @@ class Table:
         'model,rms_px\nopencv5,0.12345\nmine,\n'
     """
 
-    columns: Mapping[str, str | tuple[str, str | Callable[[Any], str]]]
+    columns: Columns
     rows: Sequence[Sequence[Any]]
 
     @property

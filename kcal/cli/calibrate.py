@@ -18,7 +18,7 @@ from kcal.cli.report import NO, judged, told_usable
 from kcal.cli.stars import Night, by_night, joined_by_stars
 from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import check_picture, check_writable, make_folder
-from kcal.table import Table
+from kcal.table import Columns, Table
 from kcal.texts import measured_text, number_text, percent_text
 
 _T = TypeVar("_T")
@@ -407,7 +407,7 @@ def batch_command(
     except KeyboardInterrupt:
         err.print("interrupted; what is finished is kept: run the same command to continue")
         raise typer.Exit(130) from None
-    columns = {
+    columns: Columns = {
         "camera": "camera", "views": "views", "rms": ("RMS px", "{:.4f}"), "focal": ("focal px", "{:.3f}"),
         "sigma_focal": ("± σ", "{:.3f}"), "cx": ("cx", "{:.3f}"), "cy": ("cy", "{:.3f}"), "model": "model",
         "note": "note",

@@ -13,7 +13,7 @@ from kcal.cli.inputs import single_camera
 from kcal.cli.options import Kind, Several
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
-from kcal.table import Table
+from kcal.table import Columns, Table
 from kcal.texts import number_text
 
 # `kcal compare`: how well lens models predict views that were held out.
@@ -65,7 +65,7 @@ def compare_command(
         )
     count = len(result.corners)
     out.print(f"{len(seen.views)} views; held out in {count} groups, {parts} parts; RMS per corner")
-    columns = {
+    columns: Columns = {
         "model": "model", "held_out_rms_px": "held-out RMS, px", "more_than_best_px": "more than the best, px",
         "standard_error_px": "± standard error",
     }  # fmt: skip

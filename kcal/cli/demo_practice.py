@@ -194,8 +194,7 @@ def _practice_parts(site: practice.PracticeSite, frames: int) -> Iterator[tuple[
         write = functools.partial(_board, site.scene, index, side, pose)
         yield Path("boards", side, f"{name.removeprefix('near-')}.png"), _BOARD_STEPS, write
     for side in practice.SIDES:
-        picture = functools.partial(site.picture, side)
-        yield Path("site", f"{side}.png"), _PICTURE_STEPS, lambda path, _, make=picture: rooms.write_png(path, make())
+        yield Path("site", f"{side}.png"), _PICTURE_STEPS, functools.partial(_picture, site, side)
     yield from ((Path("night", night_name(side)), 1, functools.partial(_night, site, side)) for side in practice.SIDES)
     yield Path("site", "sketch.png"), 1, functools.partial(_sketch, site)
     yield Path("video", "detections.jsonl"), 1, text(lambda: _detections(site, frames))
@@ -206,6 +205,10 @@ def _practice_parts(site: practice.PracticeSite, frames: int) -> Iterator[tuple[
 def _board(scene: rooms.DemoScene, index: int, side: str, pose: Any, path: Path, _: Callable[[], None]) -> None:
     image = rooms.render_board(getattr(scene.rig, side), pose, scene.near_board, scene.render, scene.generator(index))
     rooms.write_png(path, image.numpy())
+
+
+def _picture(site: practice.PracticeSite, side: practice.Side, path: Path, _: Callable[[], None]) -> None:
+    rooms.write_png(path, site.picture(side))
 
 
 def _night(site: practice.PracticeSite, side: practice.Side, path: Path, _: Callable[[], None]) -> None:

@@ -22,7 +22,7 @@ from kcal.cli.rig_sources import cameras_of_files, check_views_of
 from kcal.errors import FileError, InputError
 from kcal.file_kind import file_kind
 from kcal.files import check_writable, read_bytes, write_atomic
-from kcal.table import Table
+from kcal.table import Columns, Table
 
 # The exit code of a no, apart from errors (1) and wrong usage (2).
 NO = 3
@@ -322,7 +322,7 @@ def _check_ranges(path: Path, ranges: Path, marks: Path | None, sigma: float | N
     noise, note = pixel_sigma_and_source(sigma, rig)
     found = kcal.locate.check_ranges(rig, points.marks, points.ranges, points.sigmas, pixel_sigma=noise)
     heads = {"known_m": "known m", "sigma_m": "±", "measured_m": "measured m", "low_m": "low", "high_m": "high"}
-    columns = {
+    columns: Columns = {
         "name": "point",
         **{name: (head, "{:.4g}") for name, head in heads.items()},
         "pull": ("error / σ", "{:+.2f}"),
@@ -430,7 +430,7 @@ def _tenths(share: float) -> str:
 
 def _told_refits(found: rooms.IntervalCheck, count: int) -> bool:
     """Print the answer."""
-    columns = {
+    columns: Columns = {
         "range_m": ("range", rooms.range_label), "share": ("refits inside, %", _tenths), "share_error": ("±", _tenths),
         "lowest_share": ("lowest place, %", lambda share: f"{100 * share:.0f}"),
         "error_px": ("error px, RMS", "{:.3g}"), "stated_px": ("stated px, RMS", "{:.3g}"),
@@ -477,7 +477,7 @@ def _told_against(
     check_views_of([result.camera], [second], [path])
     with steps(f"calibrating {path.name}", None):
         found = rooms.against_capture(result, second, options, ranges)
-    columns = {
+    columns: Columns = {
         "range_m": ("range", rooms.range_label), "seen_px": ("seen px, RMS", "{:.3g}"),
         "predicted_px": ("predicted px, RMS", "{:.3g}"), "ratio": ("seen / predicted", "{:.2f}"),
         "probability": ("probability", "{:.2g}"),

@@ -16,7 +16,7 @@ from kcal.cli.stars import print_star_budget
 from kcal.errors import InputError
 from kcal.file_kind import file_kind
 from kcal.files import write_atomic
-from kcal.table import Table
+from kcal.table import Columns, Table
 from kcal.texts import length_text, range_text
 from kcal.values import WithSigma
 
@@ -118,7 +118,7 @@ def _print_towers(now: rooms.SitingMap) -> None:
 
 def _ranked_table(ranked: list[rooms.RankedSite]) -> Table:
     length = functools.partial(length_text, digits=3)
-    columns = {
+    columns: Columns = {
         "name": "candidate", "order": "build", "heading_deg": ("heading °", "{:.0f}"),
         "mean_sigma_m": ("alone", length), "covered": ("covered", lambda share: f"{100 * share:.0f} %"),
         "mean_sigma_after_m": ("after", length),

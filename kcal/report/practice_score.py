@@ -24,7 +24,7 @@ from kcal.lens.rig import Origin, Rig
 from kcal.locate.budget import range_sigmas
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.localizer import Localizer
-from kcal.table import Table
+from kcal.table import Columns, Table
 
 Floats = NDArray[np.float64]
 _FAR = 5000.0  # meters, at which errors of lenses are told
@@ -44,7 +44,7 @@ def score_cameras(cameras: Mapping[str, Camera], truth: dict[str, Any]) -> Table
     Raises:
         InputError: images of another size.
     """
-    columns = {
+    columns: Columns = {
         "camera": "camera", "rms_px": ("RMS px", "{:.3f}"), "middle_px": ("middle px", "{:.3f}"),
         "largest_px": ("largest px", "{:.3f}"), "sideways_m": ("sideways at 5 km", "{:.2f} m"),
         "range_m": ("range at 5 km", "{:.0f} m"),
@@ -81,7 +81,7 @@ def score_rig(rig: Rig, truth: dict[str, Any]) -> Table:
     if rig.mounting is None:
         rig = rig.placed(origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0)
     localize = Localizer(rig, pixel_sigma=_EXACT)
-    columns = {
+    columns: Columns = {
         "range_m": ("at", lambda far: f"{far / 1000:g} km"), "mean_m": ("mean m", _signed), "rms_m": ("RMS m", _meters),
         "stated_m": ("one sigma as stated m", _meters),
     }  # fmt: skip
@@ -100,7 +100,7 @@ def score_rig(rig: Rig, truth: dict[str, Any]) -> Table:
 def score_positions(path: Path, truth: dict[str, Any]) -> Table:
     """Positions of a file against the true ones of the same names: on the map, in range, and by their intervals."""
     true = {name.casefold(): np.array(place) for name, place in truth["targets"].items()}
-    columns = {
+    columns: Columns = {
         "target": "target", "range_m": ("range m", "{:.0f}"), "level_m": ("off on the map m", _meters),
         "range_off_m": ("off in range m", _signed),
         "contains": ("95 % interval contains it", lambda inside: "yes" if inside else "no"),
@@ -138,7 +138,7 @@ def score_tracks(path: Path, truth: dict[str, Any]) -> tuple[Table, int]:
             strays += 1
         else:
             own[nearest] += each[nearest]
-    columns = {
+    columns: Columns = {
         "ship": "ship", "range_m": ("range m", "{:.0f}"), "followed": ("followed", _shares), "tracks": "tracks",
         "level_m": ("off on the map m", _meters), "range_off_m": ("off in range m", _meters),
         "contained": ("intervals with the truth", _shares),
