@@ -240,7 +240,7 @@ class _Option:
         if not isinstance(given, list | tuple):
             return self._read(str(given))
         read = type(given)(map(self._read, given))
-        if dict not in map(get_origin, (self.type, *get_args(self.type))):
+        if dict not in [get_origin(one) for one in (self.type, *get_args(self.type))]:
             return read
         names = [name for name, _ in read]
         if twice := [name for name in names if names.count(name) > 1]:
