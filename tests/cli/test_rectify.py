@@ -16,6 +16,7 @@ from kcal import Camera, FileError, InputError, Rig, load_camera, load_rig, save
 from kcal.corners.images import decode_image
 from kcal.io.images import encode_png
 from kcal.lens import StereoRectification, Undistort
+from kcal.lens.pose import rotation_from_vector
 from kcal.lens.views import new_pinhole
 
 CAMERA = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.02, 1e-3, -1e-3])
@@ -208,6 +209,19 @@ def test_rays(folder: Path, command: Command) -> None:
     assert stored["rays"].dtype == np.float32
     assert stored["mask"].all()
     assert np.allclose(stored["Ks"][0, :2, 2], [31.5, 24.5])
+
+
+def test_rays_of_a_rig_are_in_the_frame_of_its_first_camera(folder: Path, command: Command) -> None:
+    turns = torch.tensor([[0.1, 0.4, 0.0], [0.0, -0.3, 0.2], [0.0, 0.0, 0.5]], dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, :3, :3], poses[:, :3, 3] = rotation_from_vector(turns), torch.arange(9.0).reshape(3, 3).double()
+    save_rig(Rig([CAMERA] * 3, ["a", "b", "c"], poses[:, :3, :3], poses[:, :3, 3]), folder / "three.json")
+    assert "rays 3 x 48 x 64 x 6, float32" in command("rays three.json -o rays.npz").out
+    stored = np.load(folder / "rays.npz")
+    assert np.allclose(stored["viewmats"], poses @ poses[0].inverse(), atol=1e-12)
+    # Each starts in its camera, that of the first one at the origin.
+    start = -(poses[0, :3, :3] @ poses[:, :3, :3].mT) @ poses[:, :3, 3, None] + poses[0, :3, 3, None]
+    assert np.allclose(stored["rays"][:, 20, 30, :3], start[..., 0], atol=1e-5)
 
 
 def test_image_files() -> None:
