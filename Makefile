@@ -3,6 +3,7 @@
 # make test-all  the same with the slow ones, as CI does
 # make fuzz   damaged files and messages with a fresh seed, for an hour; MINUTES=5 make fuzz: shorter
 # make test-cpus  the tests as other makes of CPU round: six times as long
+# make pages  every table of the measured pages in little: that it is made, and has the page's columns
 # make check  linters and type check only
 # make wheel  a wheel in dist/, the same to the last byte from the same commit, and its checksum
 # make docs   the documentation site, in site/; it opens without a server and can be searched offline
@@ -19,7 +20,7 @@ MINUTES ?= 60
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := demo
-.PHONY: demo test test-all fuzz test-cpus check wheel docs clean
+.PHONY: demo test test-all fuzz test-cpus pages check wheel docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/kcal demo --output $(OUT)
@@ -50,6 +51,11 @@ fuzz: $(VENV)/.installed-dev
 
 test-cpus: $(VENV)/.installed-dev
 	$(BIN)/python -m scripts.check.cpus
+
+pages: export OMP_NUM_THREADS = 1
+pages: export OPENBLAS_NUM_THREADS = 1
+pages: $(VENV)/.installed-dev
+	$(BIN)/python -m scripts.measure --quick
 
 wheel: $(VENV)/.installed-dev
 	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation \

@@ -16,6 +16,7 @@ import argparse
 import contextlib
 import importlib
 import importlib.metadata
+import itertools
 import os
 import platform
 import re
@@ -26,13 +27,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from scripts.shared.page import DOCS, write_section
+from scripts.shared.page import DOCS, read_section, write_section
 from scripts.shared.sections import SECTIONS, Kept, Section, seeds
-from scripts.shared.timing import show
+from scripts.shared.timing import children_seconds, show
 
 ROOT = Path(__file__).parent
-# Packages whose versions change what is measured.
+# Packages whose versions change what is measured, and modules of others, which count where a section loaded them.
 _TOLD = ("torch", "numpy", "scipy", "opencv-contrib-python-headless", "kornia")
+_PEERS = ("stonesoup", "onnxruntime", "pycolmap", "gtsam", "aniposelib", "Pose2Sim", "av", "rasterio", "erfa", "mpmath")
 
 
 def load(page: str) -> list[Section]:
@@ -70,7 +72,7 @@ def make(each: Section, given: dict[str, Any], *, quick: bool, write: bool) -> N
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     print(f"{each.page}: {each.name}", flush=True)
-    start, write = time.process_time(), write and not quick
+    start, children, write = time.process_time(), children_seconds(), write and not quick
     chosen = {name: value for name, value in given.items() if name in each.options and value is not None}
     more = {"write": write} if "write" in each.options else {}
     try:
@@ -82,12 +84,24 @@ def make(each: Section, given: dict[str, Any], *, quick: bool, write: bool) -> N
             raise
         print(f"left out, {missing}", flush=True)
         return
-    if lines:
-        write_section(each.page, each.name, [*lines, "", _made(each, chosen)], write=write)
-    print(f"{time.process_time() - start:.1f} CPU s", flush=True)
+    heads, there = _heads(lines), _heads(read_section(each.page, each.name).splitlines())
+    if quick and not all(any(head <= whole for whole in there) for head in heads):
+        raise ValueError(f"{each.page}, {each.name}: columns that the page does not have: {heads}")
+    if write and not all(any(whole <= head for head in heads) for whole in there):
+        raise SystemExit(f"{each.name}: not written, the page has columns that are not here: {there}; empty it first")
+    spent = f"{time.process_time() - start + children_seconds() - children:.1f} CPU s"
+    if lines and write:
+        write_section(each.page, each.name, [*lines, "", _made(each, chosen, spent)])
+    print(spent, flush=True)
 
 
-def _made(each: Section, chosen: dict[str, Any]) -> str:
+def _heads(lines: list[str]) -> list[set[str]]:
+    """Columns of the tables; numbers in them may follow from options."""
+    found = (line for line, below in itertools.pairwise(lines) if below.startswith("| ---"))
+    return [set(re.sub(r"\d+", "#", line).strip("| ").split(" | ")) for line in found]
+
+
+def _made(each: Section, chosen: dict[str, Any], spent: str) -> str:
     """By what, from what and when a section was made; a comment of the page."""
     words = [Path(each.page).stem, each.name]
     for name, default in each.options.items():
@@ -96,13 +110,19 @@ def _made(each: Section, chosen: dict[str, Any]) -> str:
             values = [f"{value.start}-{value.stop - 1}"] if isinstance(value, range) else value
             several = isinstance(values, list | tuple)
             words += [f"--{name.replace('_', '-')}", *([] if value is True else values if several else [values])]
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False).stdout
+    head, changed = (
+        subprocess.run(["git", *asked], cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
+        for asked in (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "../kcal", "."))
+    )
     machine = platform.processor() or platform.machine()
     with contextlib.suppress(OSError, AttributeError):
         machine = re.search(r"model name\s*: (.+)", Path("/proc/cpuinfo").read_text())[1]  # type: ignore[index]
     told = [f"python -m scripts.measure {shlex.join(map(str, words))}", time.strftime("%Y-%m-%d")]
-    told += [f"commit {commit.strip()}", f"{machine}, {os.cpu_count()} CPUs", f"Python {platform.python_version()}"]
-    told += [f"{name} {importlib.metadata.version(name)}" for name in _TOLD]
+    told += [f"commit {head}{' and changes' if changed else ''}", f"{machine}, {os.cpu_count()} CPUs, one thread"]
+    told += [spent, f"Python {platform.python_version()}"]
+    packages = importlib.metadata.packages_distributions()
+    others = [name for module in _PEERS if module in sys.modules for name in packages.get(module, ())]
+    told += [f"{name} {importlib.metadata.version(name)}" for name in (*_TOLD, *others)]
     return f"<!-- {', '.join(told)} -->"
 
 

@@ -67,12 +67,12 @@ def test_a_wrong_option_is_seen(wrong: str, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
 def test_a_function_makes_each_table(page: Path) -> None:
-    """Every section is closed, and has a function; of mistakes that are planted, a script of its own."""
+    """Every section is closed, and has a function."""
     text = page.read_text(encoding="utf-8")
     names = re.findall(r"<!-- begin: (.+) -->", text)
     assert names == re.findall(r"<!-- end: (.+) -->", text)
     made = [each.name for each in measure.load(page.stem) if each.name != "picture"]
-    assert sorted(made) == sorted(names) or (page.stem, names) == ("mutants", ["mutants"])
+    assert sorted(made) == sorted(names)
 
 
 # A section of many pages that takes few seconds, without real data and without other programs.
@@ -164,7 +164,7 @@ def test_a_page_says_what_its_commands_need(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     told = text[text.rindex("\n**To repeat**") :]
     assert "`pip install -e '.[bench]'`" in told
-    own = {each.make.__module__ for each in measure.load(page.stem)} or {"scripts.check.mutants"}
+    own = {each.make.__module__ for each in measure.load(page.stem)}
     asked = {name for module in own for name in needs(module)}
     assert commands(page)
     assert {name for name in asked if f"`{name}`" not in told} == set()

@@ -138,7 +138,7 @@ def cell(draw: int, board: str, pupil: float, noise: float, *, chains: Sequence[
 @section("chain.md", "chain", seeds=range(300, 301), boards=("exact",), pupils=(0.0,), chains=("true",), marks=1)
 def whole_chain(
     kept: Kept = NOT_KEPT, seeds: range = range(300, 310), boards: tuple[str, ...] = ("exact", "printed"),
-    pupils: tuple[float, ...] = (0.0, 1.0, 3.0), noise: tuple[float, ...] = (0.05, 0.2),
+    pupils: tuple[float, ...] = (0.0, 1.0, 3.0), noise: tuple[float, ...] = (0.05,),
     chains: tuple[str, ...] = tuple(CHAINS), marks: int = 24, exact: int = 4,
 ) -> list[str]:  # fmt: skip
     """So many draws of landmarks and marks for each; of these `exact` also without noise, for the lenses alone."""

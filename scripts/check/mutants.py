@@ -5,13 +5,14 @@ each, those tests of the room's own folder run that execute its lines (`coverage
 fails, without the slow ones. What nobody noticed so far also meets the tests that came too late in a long file to be
 observed. A line that no test executes is not noticed. Each mistake costs a process that begins with kcal loaded.
 
-    python -m scripts.check.mutants [ROOM ...] [--sample 8] [--seed 1] [--seconds 3600] [--budget 30] [--write]
+    python -m scripts.measure mutants --rooms lens io --sample 8 --seed 49 [--write]
 
 First, every test file runs once, to see which lines each test executes and what time it takes; `--times` prints the
-rooms and tests that take long. All results are kept in .mutants/, and another run goes on where the last one stopped.
+rooms and tests that take long. `--seconds`: after which nothing is begun; `--budget`: seconds of tests for one mistake.
+All results are kept in .mutants/, and another run goes on where the last one stopped.
 Another seed draws afresh: what was drawn with one seed is not drawn with the next. `--again` repeats mistakes that went
-unnoticed, with the tests as they are now, and changes no share; `--write` writes the table of all seeds into
-docs/measured/mutants.md, where rooms without results in .mutants/ keep their rows.
+unnoticed, with the tests as they are now, and changes no share. Rooms without results in .mutants/ keep their rows of
+the page.
 
 Neither mutmut (8 hours for one run of each mistake; it rewrites every function, which `torch.compile` refuses) nor
 cosmic-ray (a new process and the whole suite for each mistake) draws samples or chooses tests by what they execute.
@@ -19,7 +20,6 @@ cosmic-ray (a new process and the whole suite for each mistake) draws samples or
 
 from __future__ import annotations
 
-import argparse
 import ast
 import hashlib
 import importlib.machinery
@@ -29,6 +29,7 @@ import math
 import pkgutil
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, NamedTuple
@@ -38,7 +39,9 @@ import pytest
 from scripts.check.harmless import HARMLESS
 from scripts.check.mutations import Site, sites
 from scripts.check.traced_tests import FILE, ROOT, First, apart, observed, run_tests
-from scripts.shared.page import read_section, table, write_section
+from scripts.shared.page import read_section, table
+from scripts.shared.sections import section
+from scripts.shared.timing import show
 
 STATE = ROOT / ".mutants"
 # The modules at the top, beside the rooms.
@@ -244,7 +247,7 @@ def first_draw(by_seed: dict[int, Draw], row: tuple[str, ...] | None) -> str:
     return by_seed[min(by_seed)].share if len(by_seed) > 1 else ""
 
 
-def report() -> tuple[str, str]:
+def report() -> tuple[list[str], list[str]]:
     """A table of the rooms, the first and the last draw of each; and what was not noticed, or is harmless, by line."""
     kept, at_first, known = results(), results(first=True), rows_of_page()
     rows: list[tuple[object, ...]] = []
@@ -282,7 +285,7 @@ def report() -> tuple[str, str]:
         before = first_draw(by_seed, known.get(room))
         rows.append((f"`{room}`", before, last, end.drawn, end.harmless, end.share))
     if not total:
-        return "Nothing was drawn yet.", ""
+        return ["Nothing was drawn yet."], []
     low, high = interval(noticed, total)
     summary = (
         f"In the last draw of each room, {noticed} of {total} mistakes that change a result were noticed: "
@@ -294,49 +297,39 @@ def report() -> tuple[str, str]:
         *table(("line", "seed", "kind", "before", "after", "tests", "key"), missed), "",
         f"Harmless ({len(idle)})", "", *table(("line", "seed", "kind", "before", "after", "why"), idle),
     ]  # fmt: skip
-    return "\n".join([*table(heads, rows), "", summary]), "\n".join(lines)
+    return [*table(heads, rows), "", summary], lines
 
 
-def times(rooms: list[str]) -> str:
+def time_table(rooms: Sequence[str]) -> Iterator[str]:
     """Processor time of each room's tests, and the tests that take longest."""
     rows = []
     for room in rooms:
         tests = sorted(((s, name) for file in observe(room, -math.inf) for name, s in file["seconds"].items()))[::-1]
         longest = ", ".join(f"{name.split('/')[-1]} {seconds:.0f}" for seconds, name in tests[:6] if seconds >= 2)
         rows.append((f"`{room}`", len(tests), f"{sum(seconds for seconds, _ in tests):.0f}", longest))
-    return "\n".join(table(("room", "tests", "CPU s", "those of 2 s and more"), rows))
+    return table(("room", "tests", "CPU s", "those of 2 s and more"), rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("rooms", nargs="*", default=ROOMS, help=f"of kcal/, or {TOP} for the modules beside them")
-    parser.add_argument("--sample", type=int, default=8, help="mistakes in each room")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=math.inf, help="after which nothing is begun")
-    parser.add_argument("--budget", type=float, default=30.0, help="seconds of tests for one mistake")
-    parser.add_argument("--again", action="store_true", help="only what went unnoticed, with the tests as they are now")
-    parser.add_argument("--times", action="store_true", help="print the time that tests take, and nothing else")
-    parser.add_argument("--write", action="store_true", help="write the table into docs/measured/mutants.md")
-    arguments = parser.parse_args()
-    if arguments.times:
-        print(times(arguments.rooms))
-        return
+@section("mutants.md", "mutants", seconds=0.0)
+def mutants(
+    rooms: tuple[str, ...] = ROOMS, sample: int = 8, seed: int = 1, seconds: float = math.inf, budget: float = 30.0,
+    again: bool = False, times: bool = False,
+) -> list[str]:  # fmt: skip
+    if times:
+        show(list(time_table(rooms)))
+        return []
     STATE.mkdir(exist_ok=True)
-    stop = time.monotonic() + arguments.seconds
-    for room in arguments.rooms:
+    stop = time.monotonic() + seconds
+    for room in rooms:
         files, kept = observe(room, stop), results()
-        before = {key for key, entry in kept.items() if entry["seed"] != arguments.seed}
-        drawn = [draw for draw in draws(room, arguments.seed) if draw[2].key not in before]
-        for path, number, site in drawn[: arguments.sample]:
+        before = {key for key, entry in kept.items() if entry["seed"] != seed}
+        drawn = [draw for draw in draws(room, seed) if draw[2].key not in before]
+        for path, number, site in drawn[:sample]:
             if time.monotonic() > stop:
                 break
-            again = arguments.again and not kept.get(site.key, {"noticed": True})["noticed"]
-            if site.key not in HARMLESS and (site.key not in kept or again):
-                judge(files, path, number, site, arguments.budget, arguments.seed)
-    rooms, lines = report()
-    print(f"{rooms}\n\n{lines}")
-    write_section("mutants.md", "mutants", rooms, write=arguments.write)
-
-
-if __name__ == "__main__":
-    main()
+            repeat = again and not kept.get(site.key, {"noticed": True})["noticed"]
+            if site.key not in HARMLESS and (site.key not in kept or repeat):
+                judge(files, path, number, site, budget, seed)
+    found, lines = report()
+    show(lines)
+    return found

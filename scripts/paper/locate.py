@@ -47,7 +47,6 @@ def judge(scene: PaperScene, orient: Orient) -> dict[str, Any]:
     place, _ = orient(truth, seen.true_left, seen.true_right)
     found: dict[str, Any] = {
         "lens": ranges(place(*true), targets).tolist(),
-        "lens_far": rms_or_inf(ranges(place(*far.pixels), far.enu)),
         "range_error": [],
         "position_error": [],
         "reprojection": [],
@@ -78,7 +77,7 @@ def nowhere(scene: PaperScene) -> dict[str, Any]:
     each = {name: [none] * DRAWS for name in ("range_error", "position_error", "reprojection")}
     checks = [NAN] * len(scene.checks.names)
     return each | {
-        "lens": none, "lens_far": math.inf, "far": [math.inf] * DRAWS, "total": none, "marked": places,
+        "lens": none, "far": [math.inf] * DRAWS, "total": none, "marked": places,
         "integer": places, "check_reprojection": checks,
     }  # fmt: skip
 

@@ -8,7 +8,6 @@ truth.
 from __future__ import annotations
 
 import dataclasses
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -105,32 +104,24 @@ def paper_scene(kind: Kind, seed: int) -> PaperScene:
     )
 
 
-def observe(folder: Path, name: str, scene: DemoScene, side: str, views: int) -> dict[str, float]:
-    """Render, spoil and search the images of one camera; the corners go to files, the times come back."""
+def observe(folder: Path, name: str, scene: DemoScene, side: str, views: int) -> None:
+    """Render, spoil and search the images of one camera; the corners go to files."""
     lens, board = getattr(scene.rig, side), scene.near_board
     # Streams of their own for poses and noise, whatever else was drawn.
     generator = torch.Generator().manual_seed(1_000_003 * (scene.seed + 1) + 17 * len(name) + (side == "right"))
     poses = sample_board_poses(lens, board, views, generator, fill=(0.25, 0.8))
-    spent = {"render": 0.0, "detect": 0.0, "detect, OpenCV": 0.0}
     found: dict[str, list[View]] = {"kcal": [], "opencv": []}
     failures: dict[str, list[Failure]] = {"kcal": [], "opencv": []}
     for number, pose in enumerate(poses):
-        start = time.process_time()
         light = render_board(lens, pose, board, scene.render, generator)
         packed = cv2.imencode(".jpg", light.numpy(), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
         image = np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
-        spent["render"] += time.process_time() - start
-
         label = f"view-{number:02d}"
-        start = time.process_time()
         detection = detect_board(image, BOARD)
-        spent["detect"] += time.process_time() - start
         if detection.pixels is None:
             failures["kcal"].append(Failure(name=label, reason=detection.reason))
         else:
             found["kcal"].append(view_of(detection, label))
-
-        start = time.process_time()
         seen, corners = cv2.findChessboardCorners(image, (BOARD.columns, BOARD.rows), flags=CLASSIC)
         if seen:
             corners = cv2.cornerSubPix(image, corners, (11, 11), (-1, -1), (3, 30, 1e-3))
@@ -138,7 +129,6 @@ def observe(folder: Path, name: str, scene: DemoScene, side: str, views: int) ->
             found["opencv"].append(View(name=label, pixels=pixels))
         else:
             failures["opencv"].append(Failure(name=label, reason="not found"))
-        spent["detect, OpenCV"] += time.process_time() - start
     for who in found:
         Observations(
             board=BOARD,
@@ -147,4 +137,3 @@ def observe(folder: Path, name: str, scene: DemoScene, side: str, views: int) ->
             views=tuple(found[who]),
             failures=tuple(failures[who]),
         ).save(folder / f"{side}.{who}.json")
-    return spent

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +30,7 @@ MODELS = {
 }
 ALL = {**MODELS, "hybrid": "hybrid"}
 NAN = math.nan
-# What ends one model and not the whole run; the page lists it.
+# What ends one model and not the whole run.
 REFUSED = (KcalError, RuntimeError)
 FLAGS = cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL
 Pair = dict[str, tuple[Camera, float]]  # of both sides: a camera and its RMS
@@ -54,20 +52,17 @@ class _Run:
         self.true: dict[str, TruthLens] = {"left": rig.left, "right": rig.right}
         self.path = folder / "result.json"
         self.result: dict[str, Any] = {
-            "name": name, "seed": seed, "spent": {}, "cameras": {}, "held_out": {}, "located": {}, "failed": [],
+            "name": name, "seed": seed, "cameras": {}, "held_out": {}, "located": {},
         }  # fmt: skip
         if self.path.exists():
             self.result |= json.loads(self.path.read_text())
         for side in self.true:
             if not all((folder / f"{side}.{who}.json").exists() for who in ("kcal", "opencv")):
-                for stage, seconds in observe(folder, name, self.scene, side, views).items():
-                    self.result["spent"][stage] = self.result["spent"].get(stage, 0.0) + seconds
-                self._keep()
+                observe(folder, name, self.scene, side, views)
         self.seen = {side: Observations.load(folder / f"{side}.kcal.json") for side in self.true}
         self.plain = {side: Observations.load(folder / f"{side}.opencv.json") for side in self.true}
 
     def everything(self) -> dict[str, Any]:
-        self.result["views"] = {side: len(seen.views) for side, seen in self.seen.items()}
         self.result["bound"] = bound(self.scene)
         self.result["targets"] = self.scene.targets.enu.tolist()
         self.result["target_pixels"] = self.scene.target_marks.true_left.tolist()
@@ -82,66 +77,51 @@ class _Run:
 
     def _model(self, label: str, model: str) -> None:
         pair = None
-        with self._stage(f"calibrate, {label}"):
-            try:
-                found = {s: calibrate_camera(seen, CalibrationOptions(model=model)) for s, seen in self.seen.items()}
-                pair = {side: (each.camera, each.rms) for side, each in found.items()}
-            except REFUSED as error:
-                self.result["failed"].append(f"{label}: {error}")
+        with suppress(*REFUSED):
+            found = {s: calibrate_camera(seen, CalibrationOptions(model=model)) for s, seen in self.seen.items()}
+            pair = {side: (each.camera, each.rms) for side, each in found.items()}
         self._locate(label, pair)
 
     def _held_out(self) -> None:
         """RMS of views that were held out, of both cameras together."""
-        with self._stage("compare, all"):
-            # Poses are drawn and have no neighbors: every view may be held out for itself.
-            found = [
-                compare_models(seen, tuple(ALL.values()), groups="views", options=CalibrationOptions())
-                for seen in self.seen.values()
-            ]
+        # Poses are drawn and have no neighbors: every view may be held out for itself.
+        found = [
+            compare_models(seen, tuple(ALL.values()), groups="views", options=CalibrationOptions())
+            for seen in self.seen.values()
+        ]
         for label, model in ALL.items():
             squared = sum(each.rms[model] ** 2 for each in found) / len(found)
             self.result["held_out"][label] = math.sqrt(squared) if math.isfinite(squared) else NAN
         self._keep()
 
     def _opencv(self) -> None:
-        with self._stage("calibrate, OpenCV"):
-            theirs = {side: opencv_camera(seen) for side, seen in self.plain.items()}
+        theirs = {side: opencv_camera(seen) for side, seen in self.plain.items()}
         pair = {side: (as_camera(matrix, lens, self.plain[side]), rms) for side, (rms, matrix, lens) in theirs.items()}
         # Their lenses with kcal's rig and rays tell what of the difference is not lenses.
         self._locate("OpenCV, kcal's rig", pair)
         self.result["cameras"]["OpenCV"] = self.result["cameras"]["OpenCV, kcal's rig"]
-        with self._stage("rig and positions, OpenCV"):
-            raw_cameras = {side: (matrix, lens) for side, (_, matrix, lens) in theirs.items()}
-            self.result["located"]["OpenCV"] = judge(self.scene, by_opencv(raw_cameras))
+        raw_cameras = {side: (matrix, lens) for side, (_, matrix, lens) in theirs.items()}
+        self.result["located"]["OpenCV"] = judge(self.scene, by_opencv(raw_cameras))
         self._keep()
 
     def _locate(self, label: str, pair: Pair | None) -> None:
         if pair is None:
-            none = dict.fromkeys(("rms", "fx", "infinity", "infinity_max"), NAN)
+            none = dict.fromkeys(("rms", "infinity"), NAN)
             self.result["cameras"][label] = dict.fromkeys(self.true, none)
             self.result["located"][label] = nowhere(self.scene)
         else:
-            with self._stage(f"rig and positions, {label}"):
-                self.result["cameras"][label] = {s: describe(*pair[s], lens) for s, lens in self.true.items()}
-                cameras = pair["left"][0], pair["right"][0]
-                self.result["located"][label] = judge(self.scene, by_kcal(self.scene, cameras))
+            self.result["cameras"][label] = {
+                side: {"rms": pair[side][1], "infinity": error_at_infinity(pair[side][0], lens).rms}
+                for side, lens in self.true.items()
+            }
+            cameras = pair["left"][0], pair["right"][0]
+            self.result["located"][label] = judge(self.scene, by_kcal(self.scene, cameras))
         self._keep()
-
-    @contextmanager
-    def _stage(self, stage: str) -> Iterator[None]:
-        start = time.process_time()
-        yield
-        self.result["spent"][stage] = time.process_time() - start
 
     def _keep(self) -> None:
         part = self.path.with_suffix(".part")
         part.write_text(json.dumps(self.result))
         part.replace(self.path)
-
-
-def describe(camera: Camera, rms: float, truth: TruthLens) -> dict[str, float]:
-    found = error_at_infinity(camera, truth)
-    return {"rms": rms, "fx": float(camera.focal[0]), "infinity": found.rms, "infinity_max": found.maximum}
 
 
 def opencv_camera(seen: Observations) -> tuple[float, Any, Any]:
