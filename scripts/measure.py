@@ -97,7 +97,7 @@ def make(each: Section, given: dict[str, Any], *, quick: bool, write: bool) -> N
 
 def _heads(lines: list[str]) -> list[set[str]]:
     """Columns of the tables; numbers in them may follow from options."""
-    found = (line for line, below in itertools.pairwise(lines) if below.startswith("| ---"))
+    found = (line for line, below in itertools.pairwise(lines) if below.startswith(("| ---", "|---")))
     return [set(re.sub(r"\d+", "#", line).strip("| ").split(" | ")) for line in found]
 
 

@@ -8,6 +8,7 @@ are copies that differ in a comment, so that none is taken for another.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
 import signal
@@ -20,6 +21,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import psutil
 import torch
 from numpy.typing import NDArray
 
@@ -99,17 +101,11 @@ def lay_out(folder: Path, images: list[Image], count: int) -> None:
 
 
 def tree_memory(pid: int) -> int:
-    """Resident bytes of a process and its descendants (Linux)."""
-    total, queue = 0, [pid]
-    while queue:
-        one = queue.pop()
-        try:
-            pages = int(Path(f"/proc/{one}/statm").read_text().split()[1])
-            for task in Path(f"/proc/{one}/task").iterdir():
-                queue += [int(child) for child in (task / "children").read_text().split()]
-        except (OSError, ValueError):
-            continue  # it has just ended
-        total += pages * os.sysconf("SC_PAGE_SIZE")
+    """Resident bytes of a process and its descendants."""
+    total = 0
+    with contextlib.suppress(psutil.Error):  # one that has just ended
+        for one in (psutil.Process(pid), *psutil.Process(pid).children(recursive=True)):
+            total += one.memory_info().rss
     return total
 
 

@@ -26,7 +26,7 @@ from scripts.shared.sections import section
 COUNTS = (1_000, 1_000_000)
 SUFFIXES = ("csv", "geojson", "geojsonl", "kml", "cot")
 _RUN = """
-import pathlib, sys, time
+import sys, time
 from kcal.cli.main import main
 rig, small, large, out = sys.argv[1:]
 for points in (small, large):
@@ -36,9 +36,8 @@ for points in (small, large):
         main()
     except SystemExit as end:
         assert not end.code, end.code
-lines = pathlib.Path("/proc/self/status").read_text().splitlines()
-peak = next(line.split()[1] for line in lines if line.startswith("VmHWM"))
-print("measured", time.process_time() - start, peak)
+from scripts.shared.memory import peak_megabytes
+print("measured", time.process_time() - start, peak_megabytes())
 """
 
 
@@ -64,7 +63,7 @@ def run(source: Path, *arguments: Path) -> tuple[float, float]:
     found = [line.split() for line in done.stdout.splitlines() if line.startswith("measured ")]
     if done.returncode != 0 or not found:
         raise SystemExit(done.stderr)
-    return float(found[0][1]), int(found[0][2]) / 1024.0
+    return float(found[0][1]), float(found[0][2])
 
 
 def _rows(

@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import psutil
 import torch
 
 from kcal import Rig, calibrate_camera, load_camera, load_rig, save_camera, save_rig
@@ -78,12 +79,6 @@ def make_site(folder: Path, count: int) -> Marks:
     return marks
 
 
-def spent(process: int) -> float:
-    """CPU seconds of a process and all its threads."""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
 def until_address(folder: Path, *arguments: str) -> float:
     """CPU seconds of `kcal mark` until it prints the page's address."""
     command = [sys.executable, "-m", "kcal", "mark", "left.png", "right.png", *arguments, "-o", "new.csv"]
@@ -94,7 +89,7 @@ def until_address(folder: Path, *arguments: str) -> float:
     try:
         assert server.stdout is not None
         assert "http://" in server.stdout.readline()
-        return spent(server.pid)
+        return sum(psutil.Process(server.pid).cpu_times()[:2])
     finally:
         server.kill()
         server.wait()

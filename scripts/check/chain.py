@@ -2,8 +2,8 @@
 
 Truth: two ray-traced surveillance lenses (`kcal.sim.raytrace`), f 1600 px, 1920 x 1080, each with errors of
 assembly of its own, 10 m apart and nearly parallel. Their entrance pupils move by 0, 1 or 3 mm/rad²: with a focal
-length of 6.163 mm the prescription itself has 3 (`scripts.shared.traced.pupil_of` measures it), and for less its
-movement is scaled down, off-axis parts included (`wander` of `TruthLens`).
+length of 6.163 mm the prescription itself has 3, and for less its movement is
+scaled down, off-axis parts included (`wander` of `TruthLens`).
 
 Cameras: each calibrated by itself from 60 views of one board of 6 x 7 corners, 5 cm apart, at 0.55 to 1.3 m, with
 Gaussian noise of the corners. Boards are exact, or printed (`scripts.shared.traced.printed`: stretch 0.15 %, shear
@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
@@ -40,7 +39,7 @@ from scripts.check.chain_page import failures, tables
 from scripts.check.chain_rig import How, judge, targets, true_rig
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.timing import show
-from scripts.shared.traced import BOARD, as_camera, capture, printed, pupil_of
+from scripts.shared.traced import BOARD, as_camera, capture, printed
 
 VIEWS = 60
 # Shares of the image that put a board of 5 cm squares at 1.3 to 0.55 m before a lens of f 1600 px.
@@ -119,14 +118,11 @@ def cell(draw: int, board: str, pupil: float, noise: float, *, chains: Sequence[
     """All chains on one draw of lenses, board and corners; each camera is calibrated once."""
     rig = true_rig(draw, pupil)
     seen = observed(rig, draw, board, noise)
-    points, zeta, found = targets(rig), [1e3 * pupil_of(lens) for lens in (rig.left, rig.right)], []
+    points, found = targets(rig), []
     for model, group in itertools.groupby(chains, lambda chain: CHAINS[chain][0]):
-        start = time.process_time()
         cameras = calibrated(model, rig, seen)
-        spent = time.process_time() - start
         for chain in group:
-            record = {"draw": draw, "board": board, "pupil": pupil, "noise": noise, "chain": chain}
-            record |= {"pupil_measured": zeta, "calibration_s": spent}
+            record: Record = {"draw": draw, "board": board, "pupil": pupil, "noise": noise, "chain": chain}
             if isinstance(cameras, str):
                 record |= {"runs": 0, "failed": {cameras: marks}, "lenses_m": [], "sums": {}}
             else:

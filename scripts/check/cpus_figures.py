@@ -67,15 +67,7 @@ def fit_cameras(folder: Path, common: Path, only: list[str]) -> dict[str, Any]:
                 told[here] = {"status": f"refused: {error}"[:60]}
                 continue
             found.save(folder / f"{here}.json")
-            fit = found.hybrid
-            told[here] = {
-                "status": SolverStatus(found.status).name,
-                "rejected": [len(found.rejected_corners), len(found.rejected_views)],
-                "iterations": found.iterations,
-                "rms": found.rms,
-                **({"h": fit.hyperparameters.tolist(), "tempering": fit.tempering} if fit else {}),
-                **({"evidence": fit.log_evidence} if fit else {}),
-            }
+            told[here] = {"status": SolverStatus(found.status).name}
     return told
 
 

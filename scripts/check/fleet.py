@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 import psutil
 
+from scripts.shared.memory import peak_megabytes
 from scripts.shared.page import table
 from scripts.shared.sections import section
 from scripts.shared.small_photographs import COLUMNS, HEIGHT, ROWS, WIDTH, photographs
@@ -169,9 +170,7 @@ def _note_peaks(peaks: dict[str, float], command: int, on: Cluster | None) -> No
     for role, of_role in pids.items():
         for pid in of_role:
             with contextlib.suppress(OSError, StopIteration):
-                lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-                peak = int(next(line.split()[1] for line in lines if line.startswith("VmHWM"))) / 1024.0
-                peaks[role] = max(peaks[role], peak)
+                peaks[role] = max(peaks[role], peak_megabytes(pid))
 
 
 def differing(found: Path, expected: Path) -> int:

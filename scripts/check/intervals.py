@@ -49,7 +49,6 @@ def judged(model: str, seed: int, refits: int) -> Record:
         return {"refused": str(refusal)}
     return {
         "views": views,
-        "by_hand": by_hand,
         "truth": truth["everywhere"],
         "share": check.shares[0][0],
         "factor": check.factors[0],

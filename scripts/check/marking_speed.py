@@ -7,8 +7,7 @@ Seconds of the processor are given beside those of the clock: on a busy machine 
 
 from __future__ import annotations
 
-import os
-import re
+import contextlib
 import subprocess
 import sys
 import tempfile
@@ -17,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 from playwright.sync_api import sync_playwright
 
 from kcal.io.images import write_png
 from kcal.io.rig_file import save_rig
 from scripts.shared.marking_scene import background, finished, site_rig
+from scripts.shared.memory import peak_megabytes
 
 SIZE = 6000, 4000
 _DRAWN = "s => [...kcal.views[s].tiles.kept.values()].some(t => t.canvas)"
@@ -45,23 +46,13 @@ _DRAG = """async ([u, v]) => {
 }"""
 
 
-def memory(process: int) -> str:
-    """Resident memory of a process now and at most, MB."""
-    status = dict(re.findall(r"(\w+):\s+(\d+)", Path(f"/proc/{process}/status").read_text()))
-    return f"{int(status['VmRSS']) // 1024} MB (at most {int(status['VmHWM']) // 1024} MB)"
-
-
 def processor(process: int | None = None) -> float:
     """Seconds of the processor that a process has used, or the pages' renderers of Chromium."""
     total = 0.0
-    for stat in Path("/proc").glob("[0-9]*/stat" if process is None else f"{process}/stat"):
-        try:
-            fields = stat.read_text().rpartition(")")[2].split()
-            command = (stat.parent / "cmdline").read_text()
-        except OSError:
-            continue
-        if process is not None or "--type=renderer" in command or "--type=gpu-process" in command:
-            total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    for one in psutil.process_iter() if process is None else [psutil.Process(process)]:
+        with contextlib.suppress(psutil.Error):  # it has just ended
+            if process is not None or {"--type=renderer", "--type=gpu-process"} & {*one.cmdline()}:
+                total += sum(one.cpu_times()[:2])
     return total
 
 
@@ -90,7 +81,7 @@ def main() -> None:
             address = server.stdout.readline().split()[-1]
             print(
                 f"command to address: {time.perf_counter() - start:.1f} s, processor {processor(server.pid):.1f} s; "
-                f"server {memory(server.pid)}"
+                f"server at most {peak_megabytes(server.pid):.0f} MB"
             )
             with sync_playwright() as playwright:
                 browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
@@ -117,7 +108,7 @@ def main() -> None:
                 page.wait_for_timeout(2000)
                 dragged(page, "dragging a mark at 10x, with curve and range", (3000, 2000))
                 heap = page.evaluate("performance.memory.usedJSHeapSize / 1e6")
-                print(f"server {memory(server.pid)}; heap of the page {heap:.0f} MB")
+                print(f"server at most {peak_megabytes(server.pid):.0f} MB; heap of the page {heap:.0f} MB")
                 browser.close()
         finally:
             server.terminate()

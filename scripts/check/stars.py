@@ -11,6 +11,7 @@ along the horizon. σ and errors are of the rig alone, with exact marks. *lens*:
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Iterator
@@ -28,26 +29,28 @@ from kcal.stars.sky import StarCatalog, identify
 from scripts.shared.page import table
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import NOT_KEPT, Kept, section
+from scripts.shared.star_lenses import lens_trials
 from scripts.shared.timing import rms
+from scripts.shared.traced_nights import CASES, PAIRS_OF_LENSES, trial
 
 DELFT = Origin(lat=52.0, lon=4.37, height=0.0)
 SIZES = {(1600.0, (1920, 1080)), (5110.0, (1024, 768)), (900.0, (1280, 800))}
 
 
-@section("stars.md", "real")
-def real() -> Iterator[str]:
-    """Six real images: names, times, one lens, residuals by magnitude, and each image predicted by the others."""
-    files = sorted((data_folder() / "stars").glob("*.png"))
+@section("stars.md", "real", images=2)
+def real(images: int = 6) -> Iterator[str]:
+    """So many real images: names, times, one lens, residuals by magnitude, and each image predicted by the others."""
+    files = sorted((data_folder() / "stars").glob("*.png"))[:images]
     views = [SkyView(time=time_of("name:Z", path), origin=DELFT) for path in files]
-    images, seconds = [], []
+    detected, seconds = [], []
     for path in files:
         image = read_night(path)
         begin = time.process_time()
-        images.append(detect_stars(image))
+        detected.append(detect_stars(image))
         seconds.append(time.process_time() - begin)
     size = (1024, 768)
     begin = time.process_time()
-    whole = calibrate_by_stars(images, views, size)
+    whole = calibrate_by_stars(detected, views, size)
     spent_on_lens, lens = time.process_time() - begin, whole.lens
     theirs = peer(files)
     rows, said = [], []
@@ -72,7 +75,7 @@ def real() -> Iterator[str]:
         f"{sum(int((~u).sum()) for u in lens.used)} left out, RMS along an axis {lens.rms_px:.4f} px, "
         f"{lens.effective:.1f} effective unknowns, f {focal:.2f} px"
     )
-    yield held_out(images, views, size, focal)
+    yield held_out(detected, views, size, focal)
 
 
 def by_magnitude(whole: StarCamera) -> Iterator[list[str]]:
@@ -147,19 +150,17 @@ def random_points(count: int = 10_000) -> Iterator[str]:
     yield f"{count} fields of 4 to 20 random points: {wrong} with names; {spent:.2f} CPU s each"
 
 
-def rig_trial(_: str, seed: int) -> dict[str, Any]:
-    from scripts.shared.traced_nights import CASES, PAIRS_OF_LENSES, trial
-
-    return {case.name: trial(200 + seed % PAIRS_OF_LENSES, case, seed).tolist() for case in CASES}
+def rig_trial(case: str, seed: int) -> dict[str, Any]:
+    return {"squares": trial(200 + seed % PAIRS_OF_LENSES, CASES[case], seed).tolist()}
 
 
-@section("stars.md", "rigs", seeds=range(1))
-def rigs(kept: Kept = NOT_KEPT, seeds: range = range(30)) -> Iterator[str]:
+@section("stars.md", "rigs", seeds=range(1), cases=tuple(CASES)[1:2])
+def rigs(kept: Kept = NOT_KEPT, seeds: range = range(30), cases: tuple[str, ...] = tuple(CASES)) -> Iterator[str]:
     """Ranges of rigs behind traced lenses that boards calibrated: errors, and coverage of their 95 % intervals."""
-    records = kept.records([("rig", seed) for seed in seeds], rig_trial, lambda _: "done")
+    records = kept.records(itertools.product(cases, seeds), rig_trial, lambda _: "done")
     rows = []
-    for name in [name for name in records[0] if name != "key"]:
-        mean = np.mean([one[name] for one in records if name in one], axis=0)
+    for name in cases:
+        mean = np.mean([one["squares"] for one in records if one["key"][0] == name], axis=0)
         parts = (
             (np.sqrt(mean[:, 0]), 100, 2), (np.sqrt(mean[:, 1]), 100, 2), (np.sqrt(mean[:, 1] / mean[:, 0]), 1, 2),
             (mean[:, 2], 100, 0), (mean[:, 3], 100, 0),
@@ -170,16 +171,14 @@ def rigs(kept: Kept = NOT_KEPT, seeds: range = range(30)) -> Iterator[str]:
     return table([*heads, "truth in the rig's 95 %", "with marks by day ± 0.1 px"], rows)
 
 
-def lens_trial(_: str, seed: int) -> dict[str, Any]:
-    from scripts.shared.star_lenses import lens_trials
-
-    return {name: list(trial) for name, trial in lens_trials(seed).items()}
+def lens_trial(_: str, *of: int) -> dict[str, Any]:
+    return {name: list(trial) for name, trial in lens_trials(*of).items()}
 
 
-@section("stars.md", "lens", seeds=range(1))
-def lens(kept: Kept = NOT_KEPT, seeds: range = range(6)) -> Iterator[str]:
+@section("stars.md", "lens", seeds=range(2, 3), boards=5, images=2)
+def lens(kept: Kept = NOT_KEPT, seeds: range = range(6), boards: int = 20, images: int = 20) -> Iterator[str]:
     """A lens from boards, stars, and both, against the traced one at infinity; level and tilted by 30°."""
-    records = kept.records([("lens", seed) for seed in seeds], lens_trial, lambda _: "done")
+    records = kept.records([("lens", seed, boards, images) for seed in seeds], lens_trial, lambda _: "done")
     rows = []
     for name in [name for name in records[0] if name != "key"]:
         trials = [one[name] for one in records if name in one]

@@ -119,7 +119,7 @@ def compared(camera: Camera, lens: TruthLens, agreement: Agreement | None = None
     )
 
 
-def lens_trials(seed: int, boards: int = 20, images: int = 20) -> dict[str, LensTrial]:
+def lens_trials(seed: int, boards: int, images: int) -> dict[str, LensTrial]:
     """One traced lens calibrated by boards, by stars, and by both, level and tilted up by 30°."""
     lens = drawn_lens(PRESCRIPTIONS[LENSES[seed % len(LENSES)]], 1.0, seed, wander=1.0)
     seen = capture(lens, boards, 0.1, seed, printed(BOARD.points, seed), FILL)

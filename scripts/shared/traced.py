@@ -65,18 +65,6 @@ def as_observations(pixels: Tensor, size: tuple[int, int], board: Board = BOARD)
     return Observations(board=board, image_size=size, views=views)
 
 
-def pupil_of(lens: TruthLens) -> float:
-    """How far the entrance pupil moves, ζ in meters per rad²: its depth is ζ θ² for rays at the angle θ from the axis.
-
-    By least squares of the distances from all lines of sight over the image, of any common origin.
-    """
-    at, heading = lens.lines(grid(lens, 33)).spatial()
-    across = torch.eye(3, dtype=torch.float64) - heading[:, :, None] * heading[:, None, :]
-    moved = across[:, :, 2] * torch.atan2(heading[:, :2].norm(dim=-1), heading[:, 2])[:, None] ** 2
-    rows = torch.cat([across, moved[..., None]], -1).reshape(-1, 4)
-    return float(torch.linalg.lstsq(rows, (across @ at[..., None]).reshape(-1, 1)).solution[3])
-
-
 def as_camera(lens: TruthLens) -> Camera:
     """The lens itself as a camera of kcal: a hybrid lens that follows its rays, so that kcal's rigs can take it.
 

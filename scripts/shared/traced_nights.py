@@ -42,21 +42,20 @@ STRAIGHT = RigOptions(refraction=0.0, refraction_sigma=0.0)
 class Case(NamedTuple):
     """What a rig is solved from: surveyed landmarks, or pairs of night images with named stars or without names."""
 
-    name: str
     landmarks: bool = False
     pairs: int = 0
     named: bool = False
     lenses: str = "boards"
 
 
-CASES = (
-    Case("12 landmarks ± 2 cm", landmarks=True),
-    Case("1 pair, unnamed, 12 matches", pairs=1),
-    Case("1 pair, named, masts ± 1 cm", pairs=1, named=True),
-    Case("20 pairs, unnamed, 12 matches", pairs=20),
-    Case("20 pairs, named, masts ± 1 cm", pairs=20, named=True),
-    Case("the same, lenses by boards and 20 images tilted by 30°", pairs=20, named=True, lenses="stars"),
-)
+CASES = {
+    "12 landmarks ± 2 cm": Case(landmarks=True),
+    "1 pair, unnamed, 12 matches": Case(pairs=1),
+    "1 pair, named, masts ± 1 cm": Case(pairs=1, named=True),
+    "20 pairs, unnamed, 12 matches": Case(pairs=20),
+    "20 pairs, named, masts ± 1 cm": Case(pairs=20, named=True),
+    "the same, lenses by boards and 20 images tilted by 30°": Case(pairs=20, named=True, lenses="stars"),
+}
 
 
 class Lenses(NamedTuple):
