@@ -12,7 +12,6 @@ Sampson's distance of held-out corners in pixels, which needs no board.
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -131,15 +130,16 @@ def cases(few: int) -> Iterator[tuple[str, Callable[[str], str], bool]]:
     yield "OpenCV's pairs, 4 of 13", lambda name: f"{measure_epipolar(name, sides):.4f}", False
 
 
-@section("one-camera.md", "held-out", models=("opencv5",), first=1)
-def held_out_views(models: tuple[str, ...] = tuple(MODELS), views: int = 8, first: int = 6) -> Iterator[str]:
-    """With so many views of the wide lens fitted in one of its rows; the first rows only."""
+@section("one-camera.md", "held-out", models=("opencv5",), only="left, each view")
+def held_out_views(models: tuple[str, ...] = tuple(MODELS), views: int = 8, only: str = "") -> Iterator[str]:
+    """With so many views of the wide lens fitted in one of its rows; only rows whose name contains this."""
     chosen = {*models, *(["mrcal"] if "KCAL_MRCAL" in os.environ else [])}
     rows = (
         [
             what,
             *(cell(model) if model in chosen and (able or model != "mrcal") else None for model in [*MODELS, "mrcal"]),
         ]
-        for what, cell, able in itertools.islice(cases(views), first)
+        for what, cell, able in cases(views)
+        if only in what
     )
     return merged("one-camera.md", "held-out", ["held out", *MODELS, f"mrcal, {SPLINE}"], rows)

@@ -3,9 +3,10 @@
     /usr/bin/python3 scripts/bench/peer_mrcal.py problem.npz SPLINED13x9 [FIELD_OF_VIEW]
 
 The stages are those of mrcal-calibrate-cameras: a stereographic seed from a rough focal length, its refinement, the
-lens with mrcal's regularization, and with the board's warp. Prints one line of JSON: seconds of all that (process CPU), the lens with its name, and sum(w² |r|²) with its count over held-out views, whose poses alone are solved
-again. The splines cover FIELD_OF_VIEW degrees, 170 if it is left out. If it is given, the focal length and the middle
-of the image are held as they are: a narrow lens does not determine them as a stereographic one, and they run away.
+lens with mrcal's regularization, and with the board's warp. Prints one line of JSON: seconds of all that (process CPU),
+the lens with its name, and sum(w² |r|²) with its count over held-out views, whose poses alone are solved again. The
+splines cover FIELD_OF_VIEW degrees, 170 if it is left out. If it is given, the focal length and the middle of the image
+are held as they are: a narrow lens does not determine them as a stereographic one, and they run away.
 """
 
 from __future__ import annotations

@@ -41,6 +41,7 @@ SIGMAS = (0.02, 0.05, 0.1, 0.3)
 SHOWN = 0.1  # px of noise of the cells that the page shows; means are over all
 VIEWS = (60, 30, 8)
 BOARDS: tuple[str, ...] = ("exact", "printed")
+LITTLE: Record = {"lenses": LENSES[2:], "views": (8,), "noise": (SHOWN,), "boards": BOARDS[:1]}
 MODELS = {
     "hybrid": CalibrationOptions(),
     "opencv5": CalibrationOptions(model="opencv5", board_warp=True),
@@ -73,10 +74,10 @@ def cell(
 
 def fits_of(
     kept: Kept, seeds: range, lenses: tuple[str, ...], views: tuple[int, ...], noise: tuple[float, ...],
-    models: tuple[str, ...], apart: bool,
+    boards: tuple[str, ...], models: tuple[str, ...], apart: bool,
 ) -> list[Record]:  # fmt: skip
     """Every fit of every capture."""
-    keys = [(name, board, count, seed) for seed, name, board, count in itertools.product(seeds, lenses, BOARDS, views)]
+    keys = [(name, board, count, seed) for seed, name, board, count in itertools.product(seeds, lenses, boards, views)]
     work = functools.partial(cell, sigmas=noise, models=models, apart=apart)
     return [fit for record in kept.records(keys, work) for fit in record["fits"]]
 
@@ -108,12 +109,14 @@ def measured(lens: LensLike, seen: Observations, options: CalibrationOptions) ->
     }
 
 
-@section("one-camera.md", "traced", seeds=range(200, 201), lenses=LENSES[:1], views=(8,), noise=(0.1,))
+@section(
+    "one-camera.md", "traced", seeds=range(200, 201), lenses=LENSES[2:], views=(8,), noise=(0.1,), boards=("exact",)
+)
 def traced(
     kept: Kept = NOT_KEPT, seeds: range = range(200, 203), lenses: tuple[str, ...] = LENSES,
-    views: tuple[int, ...] = VIEWS, noise: tuple[float, ...] = SIGMAS,
+    views: tuple[int, ...] = VIEWS, noise: tuple[float, ...] = SIGMAS, boards: tuple[str, ...] = BOARDS,
 ) -> list[str]:  # fmt: skip
-    records = fits_of(kept, seeds, lenses, views, noise, tuple(MODELS), False)
+    records = fits_of(kept, seeds, lenses, views, noise, boards, tuple(MODELS), False)
     cells: dict[tuple[Any, ...], dict[str, list[float]]] = {}
     for r in records:
         key = (r["lens"], r["board"], r["views"], r["sigma"])
@@ -163,13 +166,16 @@ def between_seeds(records: list[Record], key: str) -> str:
     return share(map(statistics.fmean, seeds.values()), " %")
 
 
-@section("one-camera.md", "sigmas", seeds=range(200, 202), lenses=LENSES[:1], views=(8,), noise=(0.1,))
+@section(
+    "one-camera.md", "sigmas", seeds=range(200, 202), lenses=LENSES[2:], views=(8,), noise=(0.1,), boards=("exact",)
+)
 def sigmas(
     kept: Kept = NOT_KEPT, seeds: range = range(200, 212), lenses: tuple[str, ...] = LENSES,
-    views: tuple[int, ...] = (60, 30), noise: tuple[float, ...] = (0.03, 0.1, 0.2), apart: bool = False,
+    views: tuple[int, ...] = (60, 30), noise: tuple[float, ...] = (0.03, 0.1, 0.2),
+    boards: tuple[str, ...] = BOARDS, apart: bool = False,
 ) -> list[str]:  # fmt: skip
     """Predicted errors of the hybrid over true ones, and its coverage; `apart`: each noise has views of its own."""
-    records = fits_of(kept, seeds, lenses, views, noise, ("hybrid",), apart)
+    records = fits_of(kept, seeds, lenses, views, noise, boards, ("hybrid",), apart)
     cells: dict[tuple[Any, ...], list[Record]] = {}
     for r in records:
         if "predicted" in r:

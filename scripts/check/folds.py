@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +34,6 @@ from scripts.check.uncertainty import LENS
 from scripts.shared.page import table
 from scripts.shared.real_captures import stereo_images
 from scripts.shared.sections import section
-from scripts.shared.timing import show
 from scripts.shared.wide_lens import load
 
 FOCAL, SIZE = 1000.0, (1920, 1080)
@@ -263,29 +262,6 @@ def ordinary_lenses(count: int, seed: int) -> Iterator[str]:
     return table(["cameras", "number", "that fold inside the image", "valid pixels", "lost"], rows)
 
 
-def build_times(rounds: int) -> Iterator[str]:
-    """Time of `Camera.build`, and of the proof in it."""
-
-    def median(call: Callable[..., object], *arguments: object) -> float:
-        durations = []
-        for _ in range(rounds):
-            start = time.process_time()
-            call(*arguments)
-            durations.append(1e3 * (time.process_time() - start))
-        return sorted(durations)[rounds // 2]
-
-    rows = []
-    for name in ("opencv5", "opencv8", "opencv14", "ext20", "ext24", "fisheye4"):
-        model = LensModel.named(name)
-        values = (0.02, -0.01, 0.002, 0.001) if model.fisheye else LENS[: min(model.size, len(LENS))]
-        camera = Camera.build(focal=(FOCAL, FOCAL), center=(959.5, 539.5), size=SIZE, coefficients=values, model=model)
-        own = camera.params.detach()[5:]
-        build = median(camera.update_valid_region)
-        proof = median(valid_region, own, model) - median(sampled, Lens("", model, own))
-        rows.append([name, f"{build - proof:.0f}", f"{build:.0f}", f"{build / (build - proof):.2f}"])
-    return table(["model", "before the proof, ms", "now, ms", "now / before"], rows)
-
-
 @section("lens.md", "folds", lenses=3, compared=1, ordinary=0)
 def folds(
     lenses: int = 10_000, compared: int = 1000, minutes: float = math.inf, ordinary: int = 400, seed: int = 0
@@ -294,4 +270,3 @@ def folds(
     if ordinary:
         yield ""
         yield from ordinary_lenses(ordinary, seed)
-    show([*build_times(15)])

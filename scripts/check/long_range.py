@@ -1,6 +1,6 @@
 """What errs in a real scene at long range: relative yaw by noise, by halves of matches, by lenses, and by causes.
 
-Of KCAL_DATA/longrange. Cameras that are calibrated already are kept in the folder KCAL_TRIALS (here if not set).
+Of KCAL_DATA/longrange. Cameras that are calibrated already are kept in build/long-range.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.rig.marks import Features
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import Baseline, RigData
+from kcal.files import make_folder
 from kcal.io.camera_file import load_camera, save_camera
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.lens.pose import side_axes
@@ -31,7 +31,7 @@ from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import section
 
 PICTURE = Path(__file__).parents[2] / "docs" / "measured" / "long-range.png"
-TRIALS = Path(os.environ.get("KCAL_TRIALS", "."))
+TRIALS = Path("build/long-range")
 LENGTH, TAPE = 2.1336, 0.01
 HALVES = ["halves", "pitch", "yaw", "roll", "χ² of 5"]
 DEGREE = 180.0 / math.pi
@@ -44,7 +44,7 @@ Field = Callable[[Tensor], Tensor]
 
 def lens(observations: Observations, name: str, model: str | None = None) -> Camera:
     """The camera of some views, calibrated once."""
-    path, count = TRIALS / f"long-range-{name.replace(' ', '-')}.camera.json", len(observations.views)
+    path, count = make_folder(TRIALS) / f"{name.replace(' ', '-')}.camera.json", len(observations.views)
     if not path.exists():
         views = {"first half": slice(count // 2), "second half": slice(count // 2, count)}.get(name, slice(count))
         some = observations.model_copy(update={"views": observations.views[views]})
