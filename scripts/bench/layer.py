@@ -79,8 +79,8 @@ def study(views: int, lens: str) -> list[object]:
     return [views, lens, *(f"{value:.3f}" for value in cells), f"{error:.1e}", linear]
 
 
-@section("solver.md", "gradients", most=VIEWS[0])
-def gradients(most: int = VIEWS[-1]) -> Iterator[str]:
+@section("solver.md", "gradients", most=VIEWS[0], lenses=("5",))
+def gradients(most: int = VIEWS[-1], lenses: tuple[str, ...] = tuple(LENSES)) -> Iterator[str]:
     heads = ["views", "lens", "from nothing, s", "again, s", "gradient, s", "error", "Gauss-Newton"]
-    wanted = [(n, lens) for n in VIEWS if n <= most for lens in LENSES if lens != "default" or n <= MOST_DEFAULT]
+    wanted = [(n, lens) for n in VIEWS if n <= most for lens in lenses if lens != "default" or n <= MOST_DEFAULT]
     return table(heads, (study(n, lens) for n, lens in wanted))
