@@ -19,9 +19,8 @@ import json
 import math
 from pathlib import Path
 from statistics import median
-from typing import Any, cast
+from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from matplotlib.axes import Axes
@@ -32,19 +31,19 @@ from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save
 from kcal.sim.captures import PrintedBoard, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM, DemoScene, NamedPoints
-from scripts.check.chain import FLAGS as CHAIN_FLAGS
 from scripts.check.chain_rig import localizer
 from scripts.make_assets import ASSETS
 from scripts.paper.locate import SIDES
 from scripts.paper.locate import by_opencv as opencv_rig
 from scripts.shared.captures import capture_corners
+from scripts.shared.peer_lenses import FLAGS, calibrated
 from scripts.shared.timing import show
 
 RANGES, BEARINGS = (1000.0, 5000.0), (-32.0, -24.0, -16.0, -8.0, 0.0, 8.0, 16.0, 24.0, 32.0)
 NOISE, VIEWS = 0.05, 20
 FIRST = 400  # seed of the first draw; none below was looked at
-FLAGS = {f"OpenCV, {count} coefficients": flags for count, flags in ((5, 0), *CHAIN_FLAGS.items())}
-NAMES = ("kcal", *FLAGS)
+COEFFICIENTS = {f"OpenCV, {count} coefficients": count for count in FLAGS}
+NAMES = ("kcal", *COEFFICIENTS)
 FAR_SHOWN, ACROSS = 6900.0, 3900.0  # meters
 
 
@@ -81,7 +80,7 @@ def measured(draw: int) -> dict[str, Any]:
     survey = scene.surveyed(scene.landmarks)
     found: dict[str, Any] = {"draw": draw, "truth": turned(scene, scene.targets.enu).tolist()}
     for name in NAMES:
-        enu = by_kcal(scene, seen, survey) if name == "kcal" else by_opencv(scene, seen, survey, FLAGS[name])
+        enu = by_kcal(scene, seen, survey) if name == "kcal" else by_opencv(scene, seen, survey, COEFFICIENTS[name])
         there = enu.isfinite().all(-1).tolist()
         found[name] = [p if ok else None for p, ok in zip(turned(scene, enu).tolist(), there, strict=True)]
     print(draw, {name: [round(median(errors([found], name, far))) for far in RANGES] for name in NAMES}, flush=True)
@@ -104,14 +103,9 @@ def by_kcal(scene: DemoScene, seen: tuple[Observations, Observations], survey: N
     return torch.where((found.inverse_range > 0)[:, None], found.bearing / found.inverse_range[:, None], torch.nan)
 
 
-def by_opencv(scene: DemoScene, seen: tuple[Observations, Observations], survey: NamedPoints, flags: int) -> Tensor:
+def by_opencv(scene: DemoScene, seen: tuple[Observations, Observations], survey: NamedPoints, count: int) -> Tensor:
     """Positions (N, 3) of the targets by `calibrateCamera`, `solvePnP` and `triangulatePoints`."""
-    nothing, cameras = cast(Any, None), {}
-    for side, views in zip(SIDES, seen, strict=True):
-        board = [views.board.points.numpy().astype(np.float32)] * len(views.views)
-        pixels = [view.numpy().astype(np.float32) for view in views.pixels()]
-        _, matrix, lens, *_ = cv2.calibrateCamera(board, pixels, views.image_size, nothing, nothing, flags=flags)
-        cameras[side] = matrix, lens
+    cameras = {side: calibrated(views, count)[1:] for side, views in zip(SIDES, seen, strict=True)}
     marks = scene.landmark_marks
     place, _ = opencv_rig(cameras)(survey.enu, marks.left, marks.right)
     return place(scene.target_marks.true_left, scene.target_marks.true_right)
@@ -199,7 +193,7 @@ def main() -> None:
     typical = functools.partial(errors, records)
     for name in NAMES:
         show([f"{name}: " + ", ".join(f"{median(typical(name, far)):.0f} m at {far:g} m" for far in RANGES)])
-    draw(records, min(FLAGS, key=lambda name: median(typical(name, RANGES[-1]))))
+    draw(records, min(COEFFICIENTS, key=lambda name: median(typical(name, RANGES[-1]))))
 
 
 if __name__ == "__main__":

@@ -26,10 +26,9 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any
 
 import cv2
-import numpy as np
 import torch
 
 from kcal import Camera, KcalError, Observations
@@ -37,6 +36,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.sim.captures import TrueRig
 from scripts.check.chain_page import failures, tables
 from scripts.check.chain_rig import How, judge, targets, true_rig
+from scripts.shared.peer_lenses import opencv
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.timing import show
 from scripts.shared.traced import BOARD, as_camera, capture, printed
@@ -45,46 +45,21 @@ VIEWS = 60
 # Shares of the image that put a board of 5 cm squares at 1.3 to 0.55 m before a lens of f 1600 px.
 FILL = (0.40, 0.94)
 FAILURES = (KcalError, RuntimeError, cv2.error)
-RATIONAL = cv2.CALIB_RATIONAL_MODEL
-FLAGS = {8: RATIONAL, 14: RATIONAL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL}
 
 
 def by_kcal(**options: Any) -> Callable[[Observations], Camera]:
     return lambda seen: calibrate_camera(seen, CalibrationOptions(**options)).camera
 
 
-def by_opencv(count: int, *, release: bool = False) -> Callable[[Observations], Camera]:
-    """`cv2.calibrateCamera` with so many coefficients; `release`: `cv2.calibrateCameraRO`, which frees the corners."""
-
-    def calibrate(seen: Observations) -> Camera:
-        board = [seen.board.points.numpy().astype(np.float32)] * len(seen.views)
-        pixels = [view.numpy().astype(np.float32) for view in seen.pixels()]
-        data, nothing, flags = (board, pixels, seen.image_size), cast(Any, None), FLAGS[count]
-        if release:
-            # The corner at the other end of the first row sets the scale.
-            _, matrix, lens, *_ = cv2.calibrateCameraRO(*data, seen.board.columns - 1, nothing, nothing, flags=flags)
-        else:
-            _, matrix, lens, *_ = cv2.calibrateCamera(*data, nothing, nothing, flags=flags)
-        return Camera.build(
-            focal=(matrix[0, 0], matrix[1, 1]),
-            center=(matrix[0, 2], matrix[1, 2]),
-            size=seen.image_size,
-            coefficients=lens.ravel()[:count].tolist(),
-            model=f"opencv{count}",
-        )
-
-    return calibrate
-
-
-MODELS = {
+MODELS: dict[str, Callable[[Observations], Camera]] = {
     "default": by_kcal(),
     "opencv5": by_kcal(model="opencv5"),
     "opencv14": by_kcal(model="opencv14"),
     "opencv14-warp": by_kcal(model="opencv14", board_warp=True),
     "ext20": by_kcal(model="ext20"),
-    "cv8": by_opencv(8),
-    "cv14": by_opencv(14),
-    "cvRO": by_opencv(8, release=True),
+    "cv8": functools.partial(opencv, coefficients=8),
+    "cv14": functools.partial(opencv, coefficients=14),
+    "cvRO": functools.partial(opencv, coefficients=8, release=True),
 }
 HOWS: tuple[How, ...] = ("held", "prior")
 # A chain's name: its model and what the rig does with its cameras.

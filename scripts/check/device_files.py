@@ -1,7 +1,5 @@
 """Cameras of devices and data sets: how far kcal's reading of a file is from the program's published formula.
 
-    python -m scripts.check.device_files [--write]
-
 Files in the published form of each program, whose devices and programs are not here; 10,000 points all over the image.
 """
 

@@ -1,8 +1,5 @@
 """Whether a pixel has two valid rays, on lenses that are built to fold where it is hard to see.
 
-    python -m scripts.check.folds                  the table of docs/measured/lens.md
-    python -m scripts.check.folds --lenses 500
-
 The numerator and the denominator of a radial factor that nearly cancel, denominators and derivatives with nearly double
 roots, the same with tangential, prism and tilt terms, and coefficients at random. Two rays are looked for without what
 `kcal.lens.region` knows of a lens: valid points are sampled, ever more densely around the complex roots of the

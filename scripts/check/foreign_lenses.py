@@ -1,7 +1,5 @@
 """Lenses of other programs, by their published formulas written out once more, and what kcal makes of their files.
 
-    python -m scripts.check.foreign_lenses [--write]
-
 "in": a file in the program's published form, or one that pycolmap writes, read by kcal; the largest error of 10,000
 pixels all over the image against the formula, or against pycolmap's own projection. "out": a fisheye lens of 190°
 written as the program's lens; the largest distance of what the formula makes of the file from the lens itself.

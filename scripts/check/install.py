@@ -1,8 +1,5 @@
 """What an installation takes: sizes and start-up with and without extras; kcal beside other packages of OpenCV.
 
-    python -m scripts.check.install --write
-    python -m scripts.check.install extras
-
 Sizes are those of the packages in this environment that kcal or an extra needs and a smaller installation has not.
 Without extras, their modules are hidden from the same environment. OpenCV's packages are installed into temporary
 folders that come first on the path.

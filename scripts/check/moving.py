@@ -1,13 +1,11 @@
 """Rigs from targets that report their position: a drone with RTK, ships with AIS, aircraft with ADS-B.
 
-    python -m scripts.check.moving [drone ships aircraft] [--seeds 30] [--write]
-
 Two cameras 10 m apart, f 1600 px, marks of 0.3 px; their clocks are 0.7 s late, and 0.05 s apart. Positions of the
 cameras are known to 20 mm (GNSS), the baseline to 5 mm. A drone: fixes at 10 Hz of 20 mm, one minute, 120 to 260 m
 away. Ships: a fix every 8 s, rounded to 1/10,000 of a minute as AIS does, 3 m of noise, an antenna 10 m from what is
 seen, times late by 0.3 s (one sigma each), six ships 2.5 to 4 km away for ten minutes. Aircraft: a fix every second,
 rounded to 25 feet of height, 5 m of noise and 15 m in common, 0.2 s late, five of them 8 to 20 km away for four
-minutes. Of the names of ships and aircraft 30 % are wrong. With --write the table of docs/measured/moving.md is made.
+minutes. Of the names of ships and aircraft 30 % are wrong.
 """
 
 from __future__ import annotations

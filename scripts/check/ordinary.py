@@ -29,7 +29,7 @@ from kcal.report import camera_verdict
 from scripts.shared.held_out import Projection, held_out
 from scripts.shared.mrcal_camera import splined_camera
 from scripts.shared.page import table
-from scripts.shared.peer_lenses import fisheye, opencv
+from scripts.shared.peer_lenses import END, fisheye, opencv
 from scripts.shared.real_captures import RealCapture, load, names
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 
@@ -44,8 +44,8 @@ def judged(name: str) -> Record:
     record: Record = {"whole": _whole(capture), "views": [len(half.seen.views) for half in halves], "held": {}}
     kcal = _defaults(halves, record)
     fitters: dict[str, Callable[[RealCapture], Projection]] = {
-        "opencv5": lambda half: opencv(half.seen, 5),
-        "opencv8": lambda half: opencv(half.seen, 8),
+        "opencv5": lambda half: opencv(half.seen, 5, criteria=END),
+        "opencv8": lambda half: opencv(half.seen, 8, criteria=END),
         "fisheye": lambda half: fisheye(half.seen),
     }
     if "KCAL_MRCAL" in os.environ:

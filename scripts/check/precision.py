@@ -1,7 +1,5 @@
 """How exact kcal's functions are: largest errors against the same formulas in 50 digits, by quantity and dtype.
 
-    python -m scripts.check.precision [--points 200] [--write]
-
 The references are written here from the published formulas, with mpmath; none of them calls kcal. Errors are the
 largest over the points, so they grow slowly with `--points`. float32: what kcal returns for inputs rounded to float32,
 against the exact value of the inputs that were not rounded. Lenses are drawn with a fixed seed.

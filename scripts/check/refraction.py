@@ -1,7 +1,5 @@
 """Refraction of light: heights at 5 km when the coefficient is not what was assumed, with and without far landmarks.
 
-    python -m scripts.check.refraction            # prints; --write puts it into docs/measured/rig.md
-
 Truth: light bends with a coefficient of 0.13 + 0.2, 0.13 - 0.2, or one drawn from 0.13 ± 0.1. A rig of known lenses
 (scripts/shared/long_range.py) is solved from 12 landmarks, surveyed to 2 cm and marked to 0.07 px: near (40 to 400 m),
 or so that half of them stand 4 to 5 km away. Targets stand 5 km away all over the image. Their height is found with the

@@ -1,11 +1,10 @@
 """What goes to other programs and comes from them: lens, error bars, pupil, board, and the largest error in the image.
 
-    PYTHONPATH=.:FOLDER python -m scripts.check.round_trips [--mrcal /usr/bin/python3] [--write]
-
-FOLDER may have aniposelib, pycolmap, pyceres and gtsam (`pip install --target FOLDER --no-deps ...`); what is not
-there is left out and named. "out": 10,000 points all over the image through the other program's own reader, against
-kcal's pixels. "in": a file that the other program wrote, or one in its published format, read by kcal, against the
-other program's projection. σ is the largest error of a standard deviation, relative, after the way through the file.
+A FOLDER on PYTHONPATH may have aniposelib, pycolmap, pyceres and gtsam (`pip install --target FOLDER --no-deps ...`);
+what is not there is left out and named. "out": 10,000 points all over the image through the other program's own reader,
+against kcal's pixels. "in": a file that the other program wrote, or one in its published format, read by kcal, against
+the other program's projection. σ is the largest error of a standard deviation, relative, after the way through the
+file.
 """
 
 from __future__ import annotations

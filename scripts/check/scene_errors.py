@@ -1,10 +1,8 @@
 """Which errors of matches repeat, and what they do to yaw: pictures without noise beside the truth.
 
-    python -m scripts.check.scene_errors --seeds 700-711 [--write]
-
 Each seed is a terrain (`scripts.shared.terrain`, 960 x 540) with exact lenses. Keypoints are matched along the true
 epipolar lines of pictures with noise, and refined in these and in the same without noise: what then is left comes again
-in every pair of that light. Weights are those of noise and of 0.08 px. With --write docs/measured/scene.md is made.
+in every pair of that light. Weights are those of noise and of 0.08 px.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
 """Cameras between settings of zoom and focus, against ray-traced lenses.
 
-    python -m scripts.check.settings [zoom focus] [--lenses 10] [--noises 3] [--records FOLDER] [--write]
-
 The lens is `machine-vision` with errors of assembly, 1920 x 1080. *zoom*: a gap between its groups changes, so that it
 has 1340 to 1980 px of focal length and another distortion everywhere, and the sensor follows its focus. *focus*: the
 same lens at 25 mm moves away from the sensor by up to 2.7 % of its focal length. At five settings it sees 8 views of
@@ -9,8 +7,7 @@ one printed board each, with corners of 0.1 px. At a setting between them, drawn
 the truth on 9 x 7 places of the image: points at infinity, after the best-fit rotation. Interpolated from all
 five, and from the first, the middle and the last one; beside them the nearest calibration, and what is done elsewhere:
 `cv2.calibrateCamera` with five coefficients at each setting, of which each parameter is interpolated linearly.
-The last rows are cameras that were calibrated at their setting. With --write the table of docs/measured/settings.md is
-made.
+The last rows are cameras that were calibrated at their setting.
 """
 
 from __future__ import annotations
@@ -21,7 +18,6 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -33,6 +29,7 @@ from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.sim.raytrace import Misalignment, focal_length, system_matrix
 from kcal.sim.truth import TruthLens
 from scripts.shared.page import table
+from scripts.shared.peer_lenses import calibrated
 from scripts.shared.prescriptions import MACHINE_VISION
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.traced import BOARD, captures, printed
@@ -73,11 +70,8 @@ def lens_at(kind: str, setting: float, seed: int) -> TruthLens:
 
 def opencv(seen: Observations) -> Tensor:
     """Focal lengths, principal point, and five coefficients."""
-    corners = [np.array(view.pixels, dtype=np.float32).reshape(-1, 1, 2) for view in seen.views]
-    points = [BOARD.points.numpy().astype(np.float32)] * len(corners)
-    _, matrix, coefficients, _, _ = cv2.calibrateCamera(points, corners, seen.image_size, None, None)
-    fx, fy, (cx, cy) = matrix[0, 0], matrix[1, 1], matrix[:2, 2]
-    return torch.tensor([fx, fy, cx, cy, 0.0, *coefficients.ravel()[:5]], dtype=torch.float64)
+    _, matrix, coefficients = calibrated(seen, 5)
+    return torch.tensor([*matrix[[0, 1, 0, 1], [0, 1, 2, 2]], 0.0, *coefficients], dtype=torch.float64)
 
 
 def between(parameters: list[Tensor], setting: float) -> Camera:
@@ -184,7 +178,7 @@ def lines(records: list[Record], noises: int) -> Iterator[str]:
     return table(heads, rows)
 
 
-@section("settings.md", "settings", lenses=1, noises=1)
+@section("settings.md", "settings", lenses=1, noises=1, kinds=("zoom",))
 def settings(
     kept: Kept = NOT_KEPT, kinds: tuple[str, ...] = ("zoom", "focus"), lenses: int = 10, noises: int = 3
 ) -> Iterator[str]:

@@ -8,8 +8,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from kcal import Camera, KcalError, Observations
 from kcal.calibrate import compare_models
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
@@ -17,6 +15,7 @@ from kcal.sim.truth import TruthLens
 from scripts.paper.locate import bound, by_kcal, by_opencv, judge, nowhere
 from scripts.paper.site import KINDS, observe, paper_scene
 from scripts.shared.infinity import error_at_infinity
+from scripts.shared.peer_lenses import as_camera, calibrated
 
 # What the paper calls 14, 16, 18, 20, 20 (its second one), 22 and 24 parameters.
 MODELS = {
@@ -32,7 +31,6 @@ ALL = {**MODELS, "hybrid": "hybrid"}
 NAN = math.nan
 # What ends one model and not the whole run.
 REFUSED = (KcalError, RuntimeError)
-FLAGS = cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL
 Pair = dict[str, tuple[Camera, float]]  # of both sides: a camera and its RMS
 
 
@@ -95,13 +93,17 @@ class _Run:
         self._keep()
 
     def _opencv(self) -> None:
-        theirs = {side: opencv_camera(seen) for side, seen in self.plain.items()}
-        pair = {side: (as_camera(matrix, lens, self.plain[side]), rms) for side, (rms, matrix, lens) in theirs.items()}
+        theirs = {side: calibrated(seen, 14) for side, seen in self.plain.items()}
+        pair = {
+            side: (as_camera(*raw, self.plain[side].image_size, "opencv14"), rms)
+            for side, (rms, *raw) in theirs.items()
+        }
         # Their lenses with kcal's rig and rays tell what of the difference is not lenses.
         self._locate("OpenCV, kcal's rig", pair)
         self.result["cameras"]["OpenCV"] = self.result["cameras"]["OpenCV, kcal's rig"]
-        raw_cameras = {side: (matrix, lens) for side, (_, matrix, lens) in theirs.items()}
-        self.result["located"]["OpenCV"] = judge(self.scene, by_opencv(raw_cameras))
+        self.result["located"]["OpenCV"] = judge(
+            self.scene, by_opencv({s: tuple(raw) for s, (_, *raw) in theirs.items()})
+        )
         self._keep()
 
     def _locate(self, label: str, pair: Pair | None) -> None:
@@ -122,21 +124,3 @@ class _Run:
         part = self.path.with_suffix(".part")
         part.write_text(json.dumps(self.result))
         part.replace(self.path)
-
-
-def opencv_camera(seen: Observations) -> tuple[float, Any, Any]:
-    """RMS, matrix and 14 coefficients by `cv2.calibrateCamera`."""
-    board = [seen.board.points.float().numpy()] * len(seen.views)
-    pixels = [view.float().numpy() for view in seen.pixels()]
-    rms, matrix, lens, *_ = cv2.calibrateCamera(board, pixels, seen.image_size, None, None, flags=FLAGS)
-    return float(rms), matrix, lens.ravel()[:14]
-
-
-def as_camera(matrix: Any, lens: Any, seen: Observations) -> Camera:
-    return Camera.build(
-        focal=(matrix[0, 0], matrix[1, 1]),
-        center=(matrix[0, 2], matrix[1, 2]),
-        size=seen.image_size,
-        coefficients=lens.tolist(),
-        model="opencv14",
-    )

@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 import math
+from typing import Any, cast
 
 import cv2
 import numpy as np
 
 from kcal import Camera, Observations
 
-_END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 1000, 1e-12)
+FLAGS = {5: 0, 8: cv2.CALIB_RATIONAL_MODEL}
+FLAGS[14] = FLAGS[8] | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL
+END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 1000, 1e-12)
 
 
-def opencv(seen: Observations, coefficients: int) -> Camera:
-    """`cv2.calibrateCamera` with 5 or 8 coefficients.
+def calibrated(
+    seen: Observations, coefficients: int, *, release: bool = False, **options: Any
+) -> tuple[float, Any, Any]:
+    """RMS, matrix and 5, 8 or 14 coefficients of `cv2.calibrateCamera`; `release`: of `cv2.calibrateCameraRO`.
 
     Raises:
         cv2.error: OpenCV failed.
     """
-    points, pixels = _lists(seen)
-    flags = {5: 0, 8: cv2.CALIB_RATIONAL_MODEL}[coefficients]
-    _, matrix, distortion, _, _ = cv2.calibrateCamera(
-        points, pixels, seen.image_size, np.eye(3), np.zeros(coefficients), flags=flags, criteria=_END
-    )
-    return _camera(matrix, distortion.ravel()[:coefficients], seen.image_size, f"opencv{coefficients}")
+    nothing = cast(Any, None)
+    # The corner at the other end of the first row sets the scale where corners are free.
+    fixed = [seen.board.columns - 1] if release else []
+    solve = cv2.calibrateCameraRO if release else cv2.calibrateCamera
+    data = *_lists(seen), seen.image_size, *fixed, nothing, nothing
+    rms, matrix, distortion, *_ = solve(*data, flags=FLAGS[coefficients], **options)  # type: ignore[operator]
+    return float(rms), matrix, distortion.ravel()[:coefficients]
+
+
+def opencv(seen: Observations, coefficients: int, **options: Any) -> Camera:
+    """The camera of `calibrated`."""
+    _, matrix, distortion = calibrated(seen, coefficients, **options)
+    return as_camera(matrix, distortion, seen.image_size, f"opencv{coefficients}")
 
 
 def fisheye(seen: Observations) -> Camera:
@@ -44,7 +56,7 @@ def fisheye(seen: Observations) -> Camera:
         flags = always | (0 if angle is None else cv2.CALIB_USE_INTRINSIC_GUESS)
         try:
             rms, matrix, distortion, _, _ = cv2.fisheye.calibrate(
-                points, pixels, seen.image_size, start, np.zeros((4, 1)), flags=flags, criteria=_END
+                points, pixels, seen.image_size, start, np.zeros((4, 1)), flags=flags, criteria=END
             )
         except cv2.error as error:
             failure = error
@@ -54,10 +66,10 @@ def fisheye(seen: Observations) -> Camera:
     if not found:
         raise failure
     _, matrix, distortion = min(found, key=lambda one: one[0])
-    return _camera(matrix, distortion, seen.image_size, "fisheye4")
+    return as_camera(matrix, distortion, seen.image_size, "fisheye4")
 
 
-def _camera(matrix: np.ndarray, coefficients: np.ndarray, size: tuple[int, int], model: str) -> Camera:
+def as_camera(matrix: np.ndarray, coefficients: np.ndarray, size: tuple[int, int], model: str) -> Camera:
     return Camera.build(
         focal=(matrix[0, 0], matrix[1, 1]),
         center=(matrix[0, 2], matrix[1, 2]),
