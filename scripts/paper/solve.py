@@ -93,17 +93,14 @@ class _Run:
         self._keep()
 
     def _opencv(self) -> None:
-        theirs = {side: calibrated(seen, 14) for side, seen in self.plain.items()}
-        pair = {
-            side: (as_camera(*raw, self.plain[side].image_size, "opencv14"), rms)
-            for side, (rms, *raw) in theirs.items()
-        }
+        pair, raw = Pair(), dict[str, tuple[Any, Any]]()
+        for side, seen in self.plain.items():
+            rms, *found = calibrated(seen, 14)
+            pair[side], raw[side] = (as_camera(*found, seen.image_size, "opencv14"), rms), (found[0], found[1])
         # Their lenses with kcal's rig and rays tell what of the difference is not lenses.
         self._locate("OpenCV, kcal's rig", pair)
         self.result["cameras"]["OpenCV"] = self.result["cameras"]["OpenCV, kcal's rig"]
-        self.result["located"]["OpenCV"] = judge(
-            self.scene, by_opencv({s: tuple(raw) for s, (_, *raw) in theirs.items()})
-        )
+        self.result["located"]["OpenCV"] = judge(self.scene, by_opencv(raw))
         self._keep()
 
     def _locate(self, label: str, pair: Pair | None) -> None:
