@@ -98,7 +98,7 @@ def make(each: Section, given: dict[str, Any], *, quick: bool, write: bool) -> N
 def _heads(lines: list[str]) -> list[set[str]]:
     """Columns of the tables; numbers in them may follow from options."""
     found = (line for line, below in itertools.pairwise(lines) if below.startswith(("| ---", "|---")))
-    return [set(re.sub(r"\d+", "#", line).strip("| ").split(" | ")) for line in found]
+    return [{cell.strip() for cell in re.sub(r"\d+", "#", line).strip("|").split("|")} for line in found]
 
 
 def _made(each: Section, chosen: dict[str, Any], spent: str) -> str:

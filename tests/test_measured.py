@@ -75,17 +75,21 @@ def test_a_function_makes_each_table(page: Path) -> None:
     assert sorted(made) == sorted(names)
 
 
-# A section of many pages that takes few seconds, without real data and without other programs.
+# Sections that take few seconds in little, without other programs and without an installation; `make pages` runs all.
 IN_LITTLE = (
-    "lens no ray", "locate accuracy", "rig faults", "settings settings", "stars random", "stations coverage",
-    "watch drift", "solver first-order methods", "paper eq 12", "precision limits", "ordinary aspect",
-    "other-programs devices",
+    "corners refinement", "lens accuracy", "lens no ray", "lens lookup tables", "lens inverse nets", "locate accuracy",
+    "locate coverage", "locate localizer", "moving moving", "mutants mutants", "ordinary aspect",
+    "other-programs devices", "paper eq 12", "paper table 2", "precision limits", "precision lens precision",
+    "rig contradictions", "rig coverage", "rig turned", "rig faults", "solver first-order methods",
+    "solver predicted and repeated", "stars random", "stations coverage", "stations peers", "stations smoke",
+    "stations two", "tracks station tracks", "tracks station speed", "watch drift", "watch swing",
 )  # fmt: skip
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("section", IN_LITTLE)
 def test_a_section_is_made_in_little(section: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """It raises where a table has columns that the page does not have."""
     measure.main([*section.split(" ", 1), "--quick"])
     lines = capsys.readouterr().out.splitlines()
     assert not lines[1].startswith("left out, ")
@@ -103,7 +107,26 @@ def test_a_table_says_what_made_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     table, made = shared_page.read_section("lens.md", "two words").split("\n\n")
     assert table == "| x |"
     assert "python -m scripts.measure lens 'two words' --seeds 2-3 --names a, " in made
-    assert all(word in made for word in ("commit ", " CPUs", "Python 3", "torch 2", time.strftime("%Y-")))
+    told = ("commit ", " CPUs", "one thread", " CPU s", "Python 3", "torch 2", time.strftime("%Y-"))
+    assert all(word in made for word in told)
+
+
+def test_a_table_with_other_columns_is_seen(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(shared_page, "DOCS", tmp_path)
+    page = "<!-- begin: it -->\n| error of 5 |  σ |\n| --- | --- |\n| 1 | 2 |\n<!-- end: it -->\n"
+    (tmp_path / "lens.md").write_text(page)
+
+    def made(*heads: str) -> Section:
+        return Section("lens.md", "it", lambda: list(shared_page.table(heads, [["1"] * len(heads)])), {})
+
+    measure.make(made("error of 7"), {}, quick=True, write=False)  # a program that is not here, and another number
+    with pytest.raises(ValueError, match="columns that the page does not have"):
+        measure.make(made("error of 7", "s"), {}, quick=True, write=False)
+    with pytest.raises(SystemExit, match="not written, the page has columns that are not here"):
+        measure.make(made("error of 5"), {}, quick=False, write=True)
+    assert (tmp_path / "lens.md").read_text() == page
+    measure.make(made("error of 5", "σ"), {}, quick=False, write=True)
+    assert "CPU s" in (tmp_path / "lens.md").read_text()
 
 
 @functools.cache

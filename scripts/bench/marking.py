@@ -56,9 +56,9 @@ def seen_landmarks(rig: Rig, count: int, random: np.random.Generator) -> Iterato
             yield torch.stack([point[0, 0], point[0, 2], -point[0, 1]]), torch.cat([left, right])
 
 
-def make_site(folder: Path, count: int) -> Marks:
+def make_site(folder: Path, count: int, views: int) -> Marks:
     """Write pictures, a survey and a rig with its covariance, and return the marks of the landmarks."""
-    left, right = (calibrate_camera(simulated(seed, 25, 0.1, False).seen).camera for seed in _SEEDS)
+    left, right = (calibrate_camera(simulated(seed, views, 0.1, False).seen).camera for seed in _SEEDS)
     rotation = rotation_from_vector(torch.tensor([0.003, 0.006, -0.008], dtype=torch.float64))
     rig = Rig.pair(left, right, rotation, -rotation @ torch.tensor([10.0, 0.04, -0.06], dtype=torch.float64))
     random = np.random.default_rng(0)
@@ -140,12 +140,12 @@ def report(desk: Desk, marks: Marks, moves: int) -> float:
     return float(np.median([timed(functools.partial(moved, row)) for row in range(moves)]))
 
 
-@section("marking.md", "time", landmarks=6, moves=1)
-def moved_marks(landmarks: int = 12, moves: int = 12) -> Iterator[str]:
-    """So many landmarks, and how many of them are moved."""
+@section("marking.md", "time", landmarks=6, moves=1, views=6)
+def moved_marks(landmarks: int = 12, moves: int = 12, views: int = 25) -> Iterator[str]:
+    """So many landmarks, how many of them are moved, and views of which each camera is calibrated."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        marks = make_site(folder, landmarks)
+        marks = make_site(folder, landmarks, views)
         found = {"`kcal mark --rig` to its address": until_address(folder, "--rig", "rig.json")}
         for by in ("cameras", "rig"):
             with opened(folder, by) as desk:

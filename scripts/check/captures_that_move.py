@@ -168,8 +168,8 @@ def observed(pixels: Tensor, side: MovingCapture, inside: Tensor, kept: list[int
     return Observations(board=RIG_BOARD, image_size=CAMERA.size, views=views)
 
 
-def lines(records: list[Record]) -> Iterator[str]:
-    """One row for each number of views, kind and fit."""
+def lines(records: list[Record], *terms: str) -> Iterator[str]:
+    """One row for each number of views, kind and fit, and how often these terms were found."""
     cells: dict[tuple[int, str, str], list[Record]] = {}
     for record in records:
         kind, views, _, fit = record["key"]
@@ -179,19 +179,19 @@ def lines(records: list[Record]) -> Iterator[str]:
         known = [record for record in own if "refused" not in record]
         refused = f"{100 * (1 - len(known) / len(own)):.1f} %"
         if not known:
-            rows.append([views, kind, fit, len(own), refused, *["–"] * 6])
+            rows.append([views, kind, fit, len(own), refused, *["–"] * (4 + len(terms))])
             continue
         true, stated = [r["rms"] for r in known], [r["predicted"] for r in known]
         rows.append(
             [
                 views, kind, fit, len(own), refused, share(r["everywhere"] for r in known),
                 f"{statistics.median(true):.3f}", f"{rms(true):.3f}", f"{rms(stated):.3f}",
-                *(f"{100 * statistics.fmean(term in r.get('terms', ()) for r in known):.0f} %" for term in TERMS),
+                *(f"{100 * statistics.fmean(term in r.get('terms', ()) for r in known):.0f} %" for term in terms),
             ]
         )  # fmt: skip
     head = [
         "views", "held by", "fit", "captures", "refused", "in 95 %, whole image", "median error, px",
-        "RMS error", "RMS stated", "motion found", "bending found",
+        "RMS error", "RMS stated", *(f"{term} found" for term in terms),
     ]  # fmt: skip
     return table(head, rows)
 
@@ -270,7 +270,7 @@ def bent(
     fits: tuple[str, ...] = ("default",),
 ) -> Iterator[str]:  # fmt: skip
     """`stiff`: without the term for bending."""
-    return lines(captures_of(kept, seeds, views, ("bent", "few bent", "bent, hand"), fits))
+    return lines(captures_of(kept, seeds, views, ("bent", "few bent", "bent, hand"), fits), *TERMS)
 
 
 @section("ordinary.md", "moving", seeds=range(1), kinds=("stand", "0.01 s apart, hand"))

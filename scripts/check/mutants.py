@@ -255,7 +255,6 @@ def report() -> tuple[list[str], list[str]]:
     idle: list[tuple[object, ...]] = []
     total = noticed = 0
     for room in ROOMS:
-        judged = [(path, site, kept[site.key]) for path, _, site in draws(room, 0) if site.key in kept]
         folder = Path("kcal", "" if room == TOP else room)
         # Those in code that was changed since count, too.
         every = [entry for entry in kept.values() if Path(entry["path"]).parent == folder]
@@ -273,6 +272,7 @@ def report() -> tuple[list[str], list[str]]:
                 total, noticed = total + count, noticed + hits
             continue
         last = max(by_seed)
+        judged = [(path, site, kept[site.key]) for path, _, site in draws(room, 0) if site.key in kept]
         for path, site, entry in sorted(judged, key=lambda row: (row[0], row[1].line)):
             texts = (f"`{' '.join(text.split())[:70]}`".replace("|", "\\|") for text in (site.before, site.after))
             where = f"{path}:{site.line}", entry["seed"], site.kind, *texts
@@ -310,7 +310,7 @@ def time_table(rooms: Sequence[str]) -> Iterator[str]:
     return table(("room", "tests", "CPU s", "those of 2 s and more"), rows)
 
 
-@section("mutants.md", "mutants", seconds=0.0)
+@section("mutants.md", "mutants", seconds=0.0, rooms=("web",))
 def mutants(
     rooms: tuple[str, ...] = ROOMS, sample: int = 8, seed: int = 1, seconds: float = math.inf, budget: float = 30.0,
     again: bool = False, times: bool = False,

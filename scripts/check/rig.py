@@ -176,7 +176,7 @@ def coverage(draws: int = 100, marks: int = 50) -> Iterator[str]:
     return table([*heads, *(f"{distance:g} m" for distance in RANGES)], rows)
 
 
-@section("rig.md", "wrong landmark", draws=2)
+@section("rig.md", "wrong landmark", draws=1)
 @torch.no_grad()
 def wrong(draws: int = 50) -> Iterator[str]:
     """One landmark of twelve is wrong."""

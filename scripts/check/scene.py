@@ -323,7 +323,7 @@ def yaw_rows(records: list[Record]) -> Iterator[list[str]]:
 BLOCK = 120.0  # px
 
 
-@section("scene.md", "common", moments=2)
+@section("scene.md", "common", moments=1)
 @torch.no_grad()
 def common(moments: int = 6) -> Iterator[str]:
     """Whether means of errors over parts of the image are as large as stated, with and without what matches share.

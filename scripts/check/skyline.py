@@ -77,7 +77,7 @@ def alone(_: str, seed: int, *, grounds: tuple[str, ...]) -> dict[str, Any]:
 CASES = ("left", "right against left")
 
 
-def rigs(_: str, seed: int, views: int) -> dict[str, Any]:
+def rigs(kind: str, seed: int, views: int) -> dict[str, Any]:
     """Errors and sigmas of where calibrated cameras look, in pixels: (across, up) at three pixels of the skyline."""
     ground = Ground(cell=20.0, error=NATIONAL, place=0.02)
     site = site_of(seed)

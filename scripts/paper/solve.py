@@ -93,10 +93,10 @@ class _Run:
         self._keep()
 
     def _opencv(self) -> None:
-        pair, raw = Pair(), dict[str, tuple[Any, Any]]()
+        pair, raw = Pair(), dict[str, Any]()
         for side, seen in self.plain.items():
-            rms, *found = calibrated(seen, 14)
-            pair[side], raw[side] = (as_camera(*found, seen.image_size, "opencv14"), rms), (found[0], found[1])
+            rms, matrix, lens = calibrated(seen, 14)
+            pair[side], raw[side] = (as_camera(matrix, lens, seen.image_size, "opencv14"), rms), (matrix, lens)
         # Their lenses with kcal's rig and rays tell what of the difference is not lenses.
         self._locate("OpenCV, kcal's rig", pair)
         self.result["cameras"]["OpenCV"] = self.result["cameras"]["OpenCV, kcal's rig"]

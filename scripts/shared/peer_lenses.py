@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,12 +23,12 @@ def calibrated(
     Raises:
         cv2.error: OpenCV failed.
     """
-    nothing = cast(Any, None)
     # The corner at the other end of the first row sets the scale where corners are free.
     fixed = [seen.board.columns - 1] if release else []
-    solve = cv2.calibrateCameraRO if release else cv2.calibrateCamera
-    data = *_lists(seen), seen.image_size, *fixed, nothing, nothing
-    rms, matrix, distortion, *_ = solve(*data, flags=FLAGS[coefficients], **options)  # type: ignore[operator]
+    solve: Any = cv2.calibrateCameraRO if release else cv2.calibrateCamera
+    rms, matrix, distortion, *_ = solve(
+        *_lists(seen), seen.image_size, *fixed, None, None, flags=FLAGS[coefficients], **options
+    )
     return float(rms), matrix, distortion.ravel()[:coefficients]
 
 
