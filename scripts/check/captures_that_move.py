@@ -28,14 +28,24 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal import Board, Camera, KcalError, Localizer, Observations, RigOptions, calibrate_camera, calibrate_rig
+from kcal import (
+    Board,
+    CalibrationOptions,
+    Camera,
+    KcalError,
+    Localizer,
+    Observations,
+    RigOptions,
+    calibrate_camera,
+    calibrate_rig,
+)
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, sample_board_poses
 from scripts.shared.moving_captures import Hands, MovingCapture, draw_motion, moving_capture
 from scripts.shared.page import table
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
-from scripts.shared.simulated import against_truth, bends, default_options, simulated, view_of
+from scripts.shared.simulated import against_truth, bends, simulated, view_of
 from scripts.shared.timing import rms, share
 
 SIGMA = 0.08
@@ -103,7 +113,7 @@ def captured(kind: str, views: int, seed: int, fit: str) -> Record:
     by_view = shifts(what, views + 1, seed) if what.shift else None
     case = simulated(seed, views, SIGMA, what.by_hand, bent=what.bent, share=what.share, shifts=by_view)
     start = time.process_time()
-    found = against_truth(case, default_options(**FITS[fit]), None if by_view is None else by_view[-1])
+    found = against_truth(case, CalibrationOptions(**FITS[fit]), None if by_view is None else by_view[-1])
     spent = time.process_time() - start
     moved = {name: getattr(case.truth, name) for name in ("readout", "exposure", "turning", "speed")}
     return found | moved | {"cpu_s": spent, "blur": float(case.truth.blur.norm(dim=-1).square().nanmean().sqrt())}

@@ -31,12 +31,12 @@ from scripts.check.rig import (
     TRUTH,
     generator,
     landmarks,
-    matches_of,
     normal,
     seen,
     spread,
     tape,
 )
+from scripts.shared.long_range import matches_of
 from scripts.shared.page import table
 from scripts.shared.sections import section
 
@@ -66,7 +66,7 @@ def surveyed(kind: str, seed: int) -> RigData:
         marked = dataclasses.replace(marked, pixels=marks)
     if "bias" in kind:
         pixels[:, 1] += lenses[1](pixels[:, 1])
-    matches = matches_of(pixels)
+    matches = matches_of(pixels, pixel_sigma=MARK)
     return RigData(cameras=(TRUTH.left, TRUTH.right), names=NAMES, landmarks=marked,
                    features=None if "30" in kind else matches, baselines=(tape(draw),))  # fmt: skip
 

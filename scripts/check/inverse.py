@@ -4,20 +4,16 @@ For each lens two questions are asked. Points all over its valid region are proj
 again? And pixels all over the image and a margin of half its size: do those that it calls valid project back to
 themselves?
 
-    python -m scripts.check.inverse [--lenses 4000] [--seed 0]
-
 Points where a fold is so near that the lens flattens 10000 to 1 are left out of the first question: there the ray is
 not determined by the pixel. Round trips may be off by 1e-9 px and what the lens makes of the rounding of its input.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 
 import torch
-from rich.progress import track
 from torch import Tensor
 
 from kcal.lens.camera import Camera
@@ -106,26 +102,9 @@ def sweep(lenses: int, seed: int, points: int = 200) -> Tally:
     generator = torch.Generator().manual_seed(seed)
     rounds = math.ceil(lenses / (len(MODELS) * len(SCALES) * BATCH))
     jobs = [(model, scale) for model in MODELS for scale in SCALES for _ in range(rounds)]
-    for name, scale in track(jobs, "lenses", transient=True):
+    for name, scale in jobs:
         model = LensModel.named(name)
         coefficients = scale * torch.randn(BATCH, model.size, generator=generator, dtype=torch.float64)
         total.add(check_points(coefficients, model, points, generator))
         total.add(check_pixels(coefficients, model, points, generator))
     return total
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--lenses", type=int, default=4000)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    tally = sweep(arguments.lenses, arguments.seed)
-    print(f"{tally.points} points of valid regions: {tally.lost} not found, {tally.elsewhere} found elsewhere")
-    print(
-        f"{tally.pixels} pixels: {tally.valid} valid, of which {tally.wrong} do not project back; "
-        f"worst round trip {tally.worst:.1e} px"
-    )
-
-
-if __name__ == "__main__":
-    main()

@@ -24,12 +24,12 @@ from scripts.check.rig import (
     TRUTH,
     generator,
     landmarks,
-    matches_of,
     normal,
     seen,
     spread,
     tape,
 )
+from scripts.shared.long_range import matches_of
 from scripts.shared.page import table
 from scripts.shared.sections import section
 from scripts.shared.timing import rms
@@ -42,7 +42,7 @@ def data(times: float, length: float, seed: int) -> RigData:
     draw = generator(seed)
     marked = landmarks(draw)
     points = spread(MATCHES, 300.0, 8000.0, draw)
-    matches = matches_of(seen(points) + MARK * normal((MATCHES, 2, 2), draw))
+    matches = matches_of(seen(points) + MARK * normal((MATCHES, 2, 2), draw), pixel_sigma=MARK)
     measured = tape(draw, length)
     worse = marked.pixels + math.sqrt(times**2 - 1.0) * MARK * normal((len(marked.names), 2, 2), draw)
     return RigData(

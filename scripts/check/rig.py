@@ -20,7 +20,7 @@ from kcal.locate import enu_from_cam
 from kcal.report import rig_figure, save_picture
 from kcal.rig import RigCovariance
 from kcal.watch.turned import drift_of_turns, measure_drift
-from scripts.shared.long_range import ORIGIN, RANGES, rig
+from scripts.shared.long_range import ORIGIN, RANGES, matches_of, rig
 from scripts.shared.page import DOCS, table
 from scripts.shared.sections import section
 from scripts.shared.timing import rms, share
@@ -85,15 +85,6 @@ def summits(draw: torch.Generator, count: int = 20, known: float = 0.1) -> Featu
         inverse_range_sigma=sigma,
         pixel_sigma=MARK,
     )
-
-
-def matches_of(pixels: Tensor, sigma: float = MARK) -> Features:
-    """Matches (N, V, 2) of unknown range."""
-    nothing = torch.zeros(len(pixels), dtype=torch.float64)
-    return Features(
-        names=tuple(map(str, range(len(pixels)))), pixels=pixels, inverse_range=nothing,
-        inverse_range_sigma=torch.full_like(nothing, math.inf), pixel_sigma=sigma,
-    )  # fmt: skip
 
 
 def tape(draw: torch.Generator, times: float = 1.0) -> Baseline:
@@ -239,7 +230,7 @@ def drift(draws: int = 50) -> Iterator[str]:
         points = spread(count, 300.0, 8000.0, draw)
         then = seen(points) + MARK / images**0.5 * normal((count, 2, 2), draw)
         after = seen(points, turns) + MARK / images**0.5 * normal((count, 2, 2), draw)
-        features = matches_of(torch.cat([then, after], 1), MARK / images**0.5)
+        features = matches_of(torch.cat([then, after], 1), pixel_sigma=MARK / images**0.5)
         found = measure_drift(TRUTH, features=features)
         return found.relative, found.relative_covariance, found.significant, found.rig
 

@@ -40,7 +40,7 @@ from kcal.scene.match import _posed as posed
 from kcal.sim.captures import TrueRig, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM
-from scripts.shared.long_range import ORIGIN
+from scripts.shared.long_range import ORIGIN, matches_of
 from scripts.shared.page import DOCS, table
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.terrain import Terrain, Weather
@@ -224,12 +224,8 @@ def drawn(places: tuple[Tensor, Tensor, Tensor], pairs: int, draw: torch.Generat
     right = right + (torch.linalg.cholesky(covariance) @ noise[..., None])[..., 0]
     bad = torch.rand(len(right), generator=draw) < wrong
     right[bad] += 3.0 * torch.randn(int(bad.sum()), 2, dtype=torch.float64, generator=draw)
-    nothing = torch.zeros(len(left), dtype=torch.float64)
-    return Features(
-        names=tuple(map(str, range(len(left)))), pixels=torch.stack([left, right], 1), inverse_range=nothing,
-        inverse_range_sigma=torch.full_like(nothing, torch.inf),
-        covariance=0.5 * covariance[:, None].expand(-1, 2, 2, 2),
-    )  # fmt: skip
+    each = 0.5 * covariance[:, None].expand(-1, 2, 2, 2)
+    return matches_of(torch.stack([left, right], 1), covariance=each)
 
 
 def rig_data(cameras: tuple[Camera, Camera], features: Features, draw: torch.Generator) -> RigData:

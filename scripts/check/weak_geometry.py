@@ -216,17 +216,17 @@ def checked(truth: Rig, found: RigResult, draw: Draw) -> Record:
     }
 
 
-@section("rig.md", "weak geometry", part=0.001)
-def weak_geometry(kept: Kept = NOT_KEPT, part: float = 1.0) -> Iterator[str]:
+@section("rig.md", "weak geometry", part=0.001, kinds=("random",))
+def weak_geometry(kept: Kept = NOT_KEPT, part: float = 1.0, kinds: tuple[str, ...] = tuple(KINDS)) -> Iterator[str]:
     """How many sets are refused and warned of, and of their intervals contain the truth; a part of the sets."""
-    numbers = {kind: math.ceil(part * count) for kind, count in KINDS.items()}
+    numbers = {kind: math.ceil(part * KINDS[kind]) for kind in kinds}
     wanted = sorted((seed / KINDS[kind], kind, seed) for kind, count in numbers.items() for seed in range(count))
     records = kept.records((each[1:] for each in wanted), one, lambda record: record["outcome"])
     heads = ("sets", "number", "refused", "warned", "accepted")
     rows = []
     groups = {"random": ("random",), "nearly degenerate, all": DEGENERATE, **{kind: (kind,) for kind in KINDS}}
-    for name, kinds in groups.items():
-        own = [record for record in records if record["kind"] in kinds and record["outcome"] != "too few seen"]
+    for name, members in groups.items():
+        own = [record for record in records if record["kind"] in members and record["outcome"] != "too few seen"]
         by = {what: [r for r in own if r["outcome"] == what] for what in ("refused", "warned", "accepted")}
         if not own:
             continue

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from kcal import Camera, Origin, Rig
+from kcal import Camera, Features, Origin, Rig
 from kcal.lens import rotation_from_vector
 
 RANGES = (100.0, 250.0, 500.0, 1000.0, 2000.0, 3500.0, 5000.0)
@@ -21,6 +22,13 @@ def rig() -> Rig:
     right = Camera.build(focal=(1605, 1601), center=(962, 538), size=size, coefficients=[-0.19, 0.05, -2e-4, 3e-4])
     rotation = rotation_from_vector(torch.tensor([0.003, 0.02, -0.004], dtype=torch.float64))
     return Rig.pair(left, right, rotation, rotation @ torch.tensor([-10.0, 0.15, 0.2], dtype=torch.float64))
+
+
+def matches_of(pixels: Tensor, **noise: Any) -> Features:
+    """Matches (N, V, 2) of unknown range; their noise is `pixel_sigma` or `covariance`."""
+    nothing = torch.zeros(len(pixels), dtype=torch.float64)
+    names, sigma = tuple(map(str, range(len(pixels)))), torch.full_like(nothing, torch.inf)
+    return Features(names=names, pixels=pixels, inverse_range=nothing, inverse_range_sigma=sigma, **noise)
 
 
 def range_sigma(project: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor, mark: float) -> Tensor:

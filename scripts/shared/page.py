@@ -58,4 +58,6 @@ def table(heads: Sequence[object], rows: Iterable[Sequence[object]]) -> Iterator
     yield row(*heads)
     yield row(*["---"] * len(heads))
     for cells in rows:
+        if len(cells) != len(heads):
+            raise ValueError(f"{len(cells)} cells below {len(heads)} heads: {cells}")
         yield row(*cells)

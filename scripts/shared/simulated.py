@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import NamedTuple
 
@@ -129,17 +128,6 @@ def view_of(name: str, pixels: Tensor, covariance: Tensor) -> View:
         pixels=tuple((u, v) if ok else None for (u, v), ok in zip(pixels.tolist(), good, strict=True)),
         covariance=tuple((a, b, c) if ok else None for (a, b, c), ok in zip(spread, good, strict=True)),
     )
-
-
-def default_options(**switched: bool) -> CalibrationOptions:
-    """No option set but those given.
-
-    Raises:
-        SystemExit: this version of kcal has no such option.
-    """
-    if not set(switched) <= {field.name for field in dataclasses.fields(CalibrationOptions)}:
-        raise SystemExit(f"this version of kcal has no term that could be switched off: {', '.join(switched)}")
-    return CalibrationOptions(**switched)  # type: ignore[arg-type, unused-ignore]
 
 
 class Shifted(NamedTuple):

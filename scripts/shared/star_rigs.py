@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Baseline, Camera, Features, MeasuredPosition, RigData
+from kcal import Baseline, Camera, MeasuredPosition, RigData
 from kcal.calibrate.rig.marks import StarSource
 from kcal.lens.projection import FAR
 from kcal.locate import enu_from_cam
 from kcal.rig import Effect
 from kcal.stars.sky import EARTH_RATE, StarCatalog, observed_directions, pole_in_enu
+from scripts.shared.long_range import matches_of
 from scripts.shared.night_scenes import PLACE, TIME
 
 BASELINE = 10.0
@@ -91,13 +92,7 @@ def star_rig(
         rays = torch.nn.functional.pad(torch.from_numpy(way), (0, 1), value=1.0)
         points = torch.from_numpy(draw.uniform(100, 1500, (matches, 1))) * rays @ rotation[0]
         at = torch.stack([camera.project((points - c) @ r.T)[0] for r, c in zip(rotation, center, strict=True)], 1)
-        features = Features(
-            names=tuple(f"match {k}" for k in range(matches)),
-            pixels=at + torch.from_numpy(draw.normal(0, 0.1, at.shape)),
-            inverse_range=torch.zeros(matches).double(),
-            inverse_range_sigma=torch.full((matches,), math.inf).double(),
-            pixel_sigma=0.1,
-        )
+        features = matches_of(at + torch.from_numpy(draw.normal(0, 0.1, at.shape)), pixel_sigma=0.1)
     places = [
         MeasuredPosition(
             camera=c, point=center[c] + torch.from_numpy(draw.normal(0, 0.01, 3)), sigma=torch.full((3,), 0.01).double()

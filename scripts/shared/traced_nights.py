@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Baseline, Camera, Features, Localizer, MeasuredPosition, RigData, calibrate_camera
+from kcal import Baseline, Camera, Localizer, MeasuredPosition, RigData, calibrate_camera
 from kcal.calibrate.rig.marks import StarSource
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
@@ -23,7 +23,7 @@ from kcal.stars.detect import DetectedStars
 from kcal.stars.night import Attitude, NamedStars, SkyView
 from kcal.stars.sky import Air, StarCatalog, celestial_directions, observed_directions
 from scripts.check.chain_rig import ENU_FROM_RIG, Targets, landmarks, targets, true_rig
-from scripts.shared.long_range import ORIGIN, RANGES
+from scripts.shared.long_range import ORIGIN, RANGES, matches_of
 from scripts.shared.night_scenes import PLACE, TIME
 from scripts.shared.star_lenses import star_images
 from scripts.shared.traced import BOARD, capture, printed
@@ -176,13 +176,7 @@ def data_of(made: Lenses, case: Case, seed: int) -> RigData:
         rays = torch.nn.functional.pad(torch.from_numpy(way), (0, 1), value=1.0)
         left, right = rig(torch.from_numpy(draw.uniform(100, 1500, (MATCHES, 1))) * rays)[0].unbind(-2)
         marks = torch.stack([left, right], 1)
-        features = Features(
-            names=tuple(f"match {k}" for k in range(MATCHES)),
-            pixels=marks + torch.from_numpy(draw.normal(0, MARK, marks.shape)),
-            inverse_range=torch.zeros(MATCHES).double(),
-            inverse_range_sigma=torch.full((MATCHES,), math.inf).double(),
-            pixel_sigma=MARK,
-        )
+        features = matches_of(marks + torch.from_numpy(draw.normal(0, MARK, marks.shape)), pixel_sigma=MARK)
     return dataclasses.replace(data, stars=night(rig, cameras, case, draw), features=features, positions=positions)
 
 
