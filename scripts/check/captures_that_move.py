@@ -89,7 +89,9 @@ MOVING = {
     for name, kind in KINDS.items()
     if name not in ("bent", "few bent", "bent, hand")
 }
-FITS = {"default": {}, "still": {"motion": False}, "stiff": {"bending": False}}
+FITS = {
+    "default": CalibrationOptions(), "still": CalibrationOptions(motion=False), "stiff": CalibrationOptions(bending=False),
+}  # fmt: skip
 # Of rigs.
 RIG_BOARD, RIG_SIZE = Board(columns=9, rows=6, square=0.05), BoardSize(9, 6, 0.05)
 CAMERA = Camera.build(focal=(1100, 1100), center=(639.5, 479.5), size=(1280, 960), coefficients=[-0.1])
@@ -113,7 +115,7 @@ def captured(kind: str, views: int, seed: int, fit: str) -> Record:
     by_view = shifts(what, views + 1, seed) if what.shift else None
     case = simulated(seed, views, SIGMA, what.by_hand, bent=what.bent, share=what.share, shifts=by_view)
     start = time.process_time()
-    found = against_truth(case, CalibrationOptions(**FITS[fit]), None if by_view is None else by_view[-1])
+    found = against_truth(case, FITS[fit], None if by_view is None else by_view[-1])
     spent = time.process_time() - start
     moved = {name: getattr(case.truth, name) for name in ("readout", "exposure", "turning", "speed")}
     return found | moved | {"cpu_s": spent, "blur": float(case.truth.blur.norm(dim=-1).square().nanmean().sqrt())}
