@@ -90,8 +90,10 @@ MOVING = {
     if name not in ("bent", "few bent", "bent, hand")
 }
 FITS = {
-    "default": CalibrationOptions(), "still": CalibrationOptions(motion=False), "stiff": CalibrationOptions(bending=False),
-}  # fmt: skip
+    "default": CalibrationOptions(),
+    "still": CalibrationOptions(motion=False),
+    "stiff": CalibrationOptions(bending=False),
+}
 # Of rigs.
 RIG_BOARD, RIG_SIZE = Board(columns=9, rows=6, square=0.05), BoardSize(9, 6, 0.05)
 CAMERA = Camera.build(focal=(1100, 1100), center=(639.5, 479.5), size=(1280, 960), coefficients=[-0.1])

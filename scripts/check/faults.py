@@ -11,6 +11,7 @@ group.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -27,7 +28,7 @@ from scripts.shared.sections import section
 from scripts.shared.simulated import simulated
 
 OFF = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)  # m: of a wrong landmark
-CROP, ZOOM, VIEWS, NOISE = 40.0, 1.05, 20, 0.15
+CROP, ZOOM, NOISE = 40.0, 1.05, 0.15
 WITHIN = 1.96
 
 
@@ -144,16 +145,20 @@ def mixed(one: Observations, other: Observations) -> Observations:
     return one.model_copy(update={"views": (*first, *second)})
 
 
-def captures(seeds: range) -> Iterator[tuple[str, Observations, set[int]]]:
+def captures(seeds: range, views: int) -> Iterator[tuple[str, Observations, set[int]]]:
     """Kind, views, and which of them are of the second group; none in good captures."""
-    odd, late = set(range(1, VIEWS, 2)), set(range(VIEWS // 2, VIEWS))
+    odd, late = set(range(1, views, 2)), set(range(views // 2, views))
     for seed in seeds:
         for by_hand in (False, True):
-            seen, how = simulated(seed, VIEWS, NOISE, by_hand).seen, "by hand" if by_hand else "on a stand"
+            seen, how = simulated(seed, views, NOISE, by_hand).seen, "by hand" if by_hand else "on a stand"
             middle = 0.5 * torch.tensor(seen.image_size, dtype=torch.float64)
             yield f"good, {how}", seen, set()
             yield f"cropped, {how}", changed(seen, odd, lambda p: p - torch.tensor([CROP, 0.0]).double()), odd
             yield f"zoomed, {how}", changed(seen, late, lambda p, m=middle: (p - m) * ZOOM + m), late  # type: ignore[misc]
+
+
+def real_captures() -> Iterator[tuple[str, Observations, set[int]]]:
+    """The same of two cameras mixed, and of all captures as they are."""
     for left, right in (("stereo_left", "stereo_right"), ("st1_l", "st1_r")):
         both = mixed(*(load(name).seen for name in (left, right)))
         yield "two real cameras", both, {i for i, name in enumerate(both.names) if name.startswith("two")}
@@ -169,10 +174,10 @@ def rightly(text: str, seen: Observations, second: set[int]) -> float:
     return max(right, len(seen.views) - right) / len(seen.views)
 
 
-@section("ordinary.md", "two cameras", seeds=range(1))
-def of_captures(seeds: range = range(4)) -> Iterator[str]:
+@section("ordinary.md", "two cameras", seeds=range(1), views=8, simulated_only=True)
+def of_captures(seeds: range = range(4), views: int = 20, simulated_only: bool = False) -> Iterator[str]:
     found: dict[str, list[float | None]] = {}
-    for kind, seen, second in captures(seeds):
+    for kind, seen, second in itertools.chain(captures(seeds, views), () if simulated_only else real_captures()):
         share: float | None = None
         try:
             calibrate_camera(seen)
