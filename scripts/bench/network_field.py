@@ -38,10 +38,10 @@ def measure(seen: Observations, name: str, parts: int) -> tuple[float, float]:
     return held, time.process_time() - begin
 
 
-def cells(seen: Observations, parts: int) -> list[str]:
+def cells(seen: Observations, parts: int, fits: tuple[str, ...]) -> list[str]:
     """For each lens the held-out RMS, and CPU seconds in brackets."""
     out = []
-    for name in FITS:
+    for name in fits:
         try:
             held, seconds = measure(seen, name, parts)
             out.append(f"{held:.4f} ({seconds:.1f})")
@@ -52,18 +52,18 @@ def cells(seen: Observations, parts: int) -> list[str]:
     return out
 
 
-@section("network-field.md", "captures", names=("sq1280",))
-def captures(names: tuple[str, ...] = CAPTURES, parts: int = 3) -> Iterator[str]:
+@section("network-field.md", "captures", names=("sq1280",), fits=("ext20",), parts=2)
+def captures(names: tuple[str, ...] = CAPTURES, parts: int = 3, fits: tuple[str, ...] = tuple(FITS)) -> Iterator[str]:
     found = ((name, Observations.load(data_folder() / "captures" / f"{name}.obs.json")) for name in names)
-    rows = ([name, len(seen.views), *cells(seen, parts)] for name, seen in found)
-    return merged("network-field.md", "captures", ["capture", "views", *FITS], rows)
+    rows = ([name, len(seen.views), *cells(seen, parts, fits)] for name, seen in found)
+    return merged("network-field.md", "captures", ["capture", "views", *fits], rows)
 
 
-@section("network-field.md", "dent")
-def dent() -> Iterator[str]:
+@section("network-field.md", "dent", fits=("ext20",))
+def dent(fits: tuple[str, ...] = tuple(FITS)) -> Iterator[str]:
     """For each lens the error at infinity over the middle of the image of a lens with a dent, pixels."""
     out = []
-    for model, training in FITS.values():
+    for model, training in map(FITS.__getitem__, fits):
         options = CalibrationOptions(model=model)
         if model == "hybrid":
             options = CalibrationOptions(board="exact", motion=False)
@@ -72,4 +72,4 @@ def dent() -> Iterator[str]:
         begin = time.process_time()
         camera = calibrate_camera(capture(), options).camera
         out.append(f"{off(camera):.3f} ({time.process_time() - begin:.1f})")
-    return table(["lens", *FITS], [["with a dent of 3 px", *out]])
+    return table(["lens", *fits], [["with a dent of 3 px", *out]])

@@ -9,7 +9,7 @@ from scripts.paper.numbers import TABLE_3, Results, median, number, position
 from scripts.paper.range import choice, distance, edges
 from scripts.paper.site import MARK_SIGMA
 from scripts.paper.split import split
-from scripts.paper.tables import table_1, table_2, table_3
+from scripts.paper.tables import table_1, table_3
 from scripts.shared.page import table
 
 
@@ -49,7 +49,6 @@ def _far_share(runs: list[dict], label: str, kind: str) -> float:
 SECTIONS: dict[str, Callable[[Results], Iterable[str]]] = {
     "split": split,
     "table 1": table_1,
-    "table 2": lambda _: table_2(),
     "table 3": table_3,
     "models": _figure_3,
     "marks": _marks,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -18,29 +19,33 @@ from scripts.paper.figures import write_figures
 from scripts.paper.numbers import Results
 from scripts.paper.page import SECTIONS
 from scripts.paper.site import KINDS
-from scripts.paper.solve import run_seed
+from scripts.paper.solve import ALL, run_seed
+from scripts.paper.tables import table_2
 from scripts.shared.sections import section
+
+# Of runs in little, which share one draw.
+_LITTLE = tempfile.TemporaryDirectory(prefix="kcal-paper-")
 
 
 @functools.cache
-def results_of(work: Path, seeds: int, views: int, kinds: tuple[str, ...]) -> Results:
+def results_of(work: Path, seeds: int, views: int, kinds: tuple[str, ...], models: tuple[str, ...]) -> Results:
     """Seed by seed, so that a run that is stopped has something of every kind."""
     results: Results = {}
     for seed, name in itertools.product(range(seeds), kinds):
-        results.setdefault(name, []).append(run_seed(work / f"{name}-{seed}-{views}", name, seed, views))
+        results.setdefault(name, []).append(run_seed(work / f"{name}-{seed}-{views}", name, seed, views, models))
     return results
 
 
 def _registered(name: str, made: Callable[[Results], Iterable[str]]) -> None:
-    @section("paper.md", name, kinds=("none",))
+    @section("paper.md", name, kinds=("vision",), seeds=1, views=5, models=("14",), work=Path(_LITTLE.name))
     def part(
         work: Path = Path("build/paper"), seeds: int = 5, views: int = 30, kinds: tuple[str, ...] = tuple(KINDS),
-        write: bool = False,
+        models: tuple[str, ...] = tuple(ALL), write: bool = False,
     ) -> Iterator[str]:  # fmt: skip
         """Views of each camera; corners and results stay in the folder."""
         if not set(kinds) <= {*KINDS}:
             raise SystemExit(f"kinds of cameras: {', '.join(KINDS)}")
-        results = results_of(work, seeds, views, kinds)
+        results = results_of(work, seeds, views, kinds, models)
         yield from made(results)
         if write and name == "split":
             write_figures(results)
@@ -48,3 +53,4 @@ def _registered(name: str, made: Callable[[Results], Iterable[str]]) -> None:
 
 for _name, _made in SECTIONS.items():
     _registered(_name, _made)
+section("paper.md", "table 2")(table_2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -34,10 +35,10 @@ REFUSED = (KcalError, RuntimeError)
 Pair = dict[str, tuple[Camera, float]]  # of both sides: a camera and its RMS
 
 
-def run_seed(folder: Path, name: str, seed: int, views: int) -> dict[str, Any]:
-    """Everything of one seed of one kind of camera; what is in the folder is not made again."""
+def run_seed(folder: Path, name: str, seed: int, views: int, models: Collection[str] = ALL) -> dict[str, Any]:
+    """Everything of one seed of one kind of camera; what is in the folder is not made again, nor other models."""
     folder.mkdir(parents=True, exist_ok=True)
-    return _Run(folder, name, seed, views).everything()
+    return _Run(folder, name, seed, views).everything(models)
 
 
 class _Run:
@@ -60,15 +61,15 @@ class _Run:
         self.seen = {side: Observations.load(folder / f"{side}.kcal.json") for side in self.true}
         self.plain = {side: Observations.load(folder / f"{side}.opencv.json") for side in self.true}
 
-    def everything(self) -> dict[str, Any]:
+    def everything(self, models: Collection[str]) -> dict[str, Any]:
         self.result["bound"] = bound(self.scene)
         self.result["targets"] = self.scene.targets.enu.tolist()
         self.result["target_pixels"] = self.scene.target_marks.true_left.tolist()
         for label, model in ALL.items():
             if label not in self.result["located"]:
-                self._model(label, model)
+                self._model(label, model) if label in models else self._locate(label, None)
         if not self.result["held_out"]:
-            self._held_out()
+            self._held_out({label: model for label, model in ALL.items() if label in models})
         if not {"OpenCV", "OpenCV, kcal's rig"} <= set(self.result["located"]):
             self._opencv()
         return self.result
@@ -80,14 +81,15 @@ class _Run:
             pair = {side: (each.camera, each.rms) for side, each in found.items()}
         self._locate(label, pair)
 
-    def _held_out(self) -> None:
+    def _held_out(self, models: dict[str, str]) -> None:
         """RMS of views that were held out, of both cameras together."""
         # Poses are drawn and have no neighbors: every view may be held out for itself.
         found = [
-            compare_models(seen, tuple(ALL.values()), groups="views", options=CalibrationOptions())
+            compare_models(seen, tuple(models.values()), groups="views", options=CalibrationOptions())
             for seen in self.seen.values()
         ]
-        for label, model in ALL.items():
+        self.result["held_out"] = dict.fromkeys(ALL, NAN)
+        for label, model in models.items():
             squared = sum(each.rms[model] ** 2 for each in found) / len(found)
             self.result["held_out"][label] = math.sqrt(squared) if math.isfinite(squared) else NAN
         self._keep()

@@ -32,12 +32,10 @@ from scripts.shared.sections import section
 from scripts.shared.timing import median, spread
 from scripts.shared.views import NOISE, SIZE, observed, simulate
 
-VIEWS, HELD_OUT = 20, 20
 # Half the image's width in focal lengths, a little more.
 REACH = 0.65
 RATES = [10.0**e for e in range(-4, 6)]
 TRIAL = 0.1
-LM_STEPS = 1000
 METHODS = {"gradient descent": torch.optim.SGD, "Adam": torch.optim.Adam}
 LM = "Levenberg-Marquardt"
 
@@ -55,9 +53,9 @@ def rms_of(problem: PureLensProblem, cost: Tensor) -> np.ndarray:
     return torch.sqrt(4.0 * cost / problem.residual_count).numpy()
 
 
-def by_lm(lens: PureLensNet, board: Tensor, pixels: Tensor, poses: tuple[Tensor, Tensor]) -> Run:
+def by_lm(lens: PureLensNet, board: Tensor, pixels: Tensor, poses: tuple[Tensor, Tensor], most: int) -> Run:
     clock = time.process_time()
-    result = train_pure_lens(lens, board, pixels, poses, LMOptions(max_iterations=LM_STEPS, tolerance=1e-9))
+    result = train_pure_lens(lens, board, pixels, poses, LMOptions(max_iterations=most, tolerance=1e-9))
     return Run(rms_of(PureLensProblem(board, pixels, lens), result.history), time.process_time() - clock, result.state)
 
 
@@ -139,10 +137,12 @@ def draw(runs: dict[str, dict[str, list[Run]]], path: Path) -> None:
     figure.savefig(path, dpi=90)
 
 
-@section("paper.md", "net lens", steps=1, seeds=1)
-def net_lens(steps: int = 2000, seeds: int = 3, picture: Path | None = None) -> Iterator[str]:
-    """`picture`: draw RMS over steps into this file."""
-    data, more = simulate(VIEWS), simulate(HELD_OUT, seed=1000)
+@section("paper.md", "net lens", steps=1, lm_steps=3, seeds=1, views=4)
+def net_lens(
+    steps: int = 2000, lm_steps: int = 1000, seeds: int = 3, views: int = 20, picture: Path | None = None
+) -> Iterator[str]:
+    """`views`: fitted, and as many held out. `picture`: draw RMS over steps into this file."""
+    data, more = simulate(views), simulate(views, seed=1000)
     board, pixels, others = (torch.from_numpy(a) for a in (data["board"], data["pixels"], more["pixels"]))
     true_poses = torch.from_numpy(more["rotation"]), torch.from_numpy(more["translation"])
     base = fit_projection(board, pixels, SIZE, torch.ones_like(pixels[..., 0])).state
@@ -159,7 +159,7 @@ def net_lens(steps: int = 2000, seeds: int = 3, picture: Path | None = None) -> 
                 problem = PureLensProblem(board, pixels, lens)
                 start = problem.start(*poses)
                 if method == LM:
-                    repeats.append(by_lm(lens, board, pixels, poses))
+                    repeats.append(by_lm(lens, board, pixels, poses, lm_steps))
                 else:
                     rate = best_rate(problem, start, method, steps) if rate is None else rate
                     repeats.append(descend(problem, start, method, rate, steps))
