@@ -169,8 +169,9 @@ def latency(calls: int = 200, eager: bool = False) -> Iterator[str]:
         depth = 10 ** torch.empty(count, dtype=torch.float64).uniform_(2.3, 3.7, generator=random)
         place = torch.stack([torch.empty(count).uniform_(-s, s, generator=random) for s in (0.45, 0.25)], -1)
         points = torch.cat([place.double(), torch.ones(count, 1)], -1) * depth[:, None]
-        exact = rig(points)
-        pixels, others = (at + 0.1 * torch.randn(count, 2, generator=random, dtype=torch.float64) for at in exact[:2])
+        exact = rig(points)[0]
+        noisy = exact + 0.1 * torch.randn(2, count, 2, generator=random, dtype=torch.float64).movedim(0, 1)
+        pixels, others = noisy.unbind(1)
         covariance = 0.01 * torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
         first, second = boxes(pixels), boxes(others)
         # In images that are shifted by a whole number of pixels, so that all objects are 1 km away.
