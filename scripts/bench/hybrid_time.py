@@ -22,6 +22,7 @@ import numpy as np
 
 from kcal.corners.board import Board
 from scripts.bench import solver
+from scripts.shared.children import answer
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import table
@@ -49,10 +50,7 @@ def work(way: str, views: int, cameras: int) -> None:
 
 def own(way: str, views: int, cameras: int = 1) -> dict[str, Any]:
     code = f"from scripts.bench.hybrid_time import work; work({way!r}, {views}, {cameras})"
-    one_thread = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=one_thread)
-    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
-    return found
+    return answer(sys.executable, "-c", code)
 
 
 def spline(data: dict[str, np.ndarray], timeout: float) -> dict[str, Any]:

@@ -6,8 +6,6 @@ system), not time of day, so that other work on the machine counts less. Of seve
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -15,10 +13,10 @@ from pathlib import Path
 
 import torch
 
-import kcal
 from kcal import save_rig
 from kcal.rig import Mounting, mounting_covariance
 from scripts.bench.locate import known_to, some_points
+from scripts.shared.children import answer
 from scripts.shared.long_range import ORIGIN, rig
 from scripts.shared.page import table
 from scripts.shared.sections import section
@@ -26,7 +24,7 @@ from scripts.shared.sections import section
 COUNTS = (1_000, 1_000_000)
 SUFFIXES = ("csv", "geojson", "geojsonl", "kml", "cot")
 _RUN = """
-import sys, time
+import json, sys, time
 from kcal.cli.main import main
 rig, small, large, out = sys.argv[1:]
 for points in (small, large):
@@ -37,7 +35,7 @@ for points in (small, large):
     except SystemExit as end:
         assert not end.code, end.code
 from scripts.shared.memory import peak_megabytes
-print("measured", time.process_time() - start, peak_megabytes())
+print(json.dumps({"seconds": time.process_time() - start, "megabytes": peak_megabytes()}))
 """
 
 
@@ -54,21 +52,8 @@ def write_table(path: Path, count: int) -> Path:
     return path
 
 
-def run(source: Path, *arguments: Path) -> tuple[float, float]:
-    """Processor seconds and peak megabytes of one table, after a table of one row."""
-    paths = os.pathsep.join([str(source), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", _RUN, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=source)
-    found = [line.split() for line in done.stdout.splitlines() if line.startswith("measured ")]
-    if done.returncode != 0 or not found:
-        raise SystemExit(done.stderr)
-    return float(found[0][1]), float(found[0][2])
-
-
-def _rows(
-    source: Path, folder: Path, suffixes: tuple[str, ...], counts: tuple[int, ...], repeat: int
-) -> Iterator[list[str]]:
+def _rows(folder: Path, suffixes: tuple[str, ...], counts: tuple[int, ...], repeat: int) -> Iterator[list[str]]:
+    """After a table of one row."""
     exact, known = rig(), rig()
     exact.mounting = Mounting(origin=ORIGIN, heading_deg=35.0)
     known.mounting = Mounting(
@@ -83,17 +68,16 @@ def _rows(
                 continue
             out = folder / f"out.{suffix}"
             for count in counts:
-                found = [run(source, path, tables[1], tables[count], out) for _ in range(repeat)]
-                seconds, peak = min(each[0] for each in found), max(each[1] for each in found)
+                command = sys.executable, "-c", _RUN, path, tables[1], tables[count], out
+                found = [answer(*command) for _ in range(repeat)]
+                seconds, peak = min(each["seconds"] for each in found), max(each["megabytes"] for each in found)
                 yield [f".{suffix}", name, f"{count:,}", f"{count / seconds:,.0f}", f"{peak:.0f}"]
                 out.unlink()
 
 
 @section("locate.md", "tables", rows=(1000,), formats=("csv",), repeat=1)
-def tables(
-    rows: tuple[int, ...] = COUNTS, formats: tuple[str, ...] = SUFFIXES, repeat: int = 3, source: Path | None = None
-) -> Iterator[str]:
-    """Each format with each rig; `source` measures another copy of kcal, for example an earlier version."""
+def tables(rows: tuple[int, ...] = COUNTS, formats: tuple[str, ...] = SUFFIXES, repeat: int = 3) -> Iterator[str]:
+    """Each format with each rig."""
     with tempfile.TemporaryDirectory() as name:
-        made = _rows(source or Path(kcal.__file__).parents[1], Path(name), formats, rows, repeat)
+        made = _rows(Path(name), formats, rows, repeat)
         yield from table(["file", "rig", "rows", "rows a second of processor time", "peak MB"], made)

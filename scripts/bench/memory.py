@@ -7,8 +7,6 @@ of `/proc/self/status`, so Linux is needed.
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -21,6 +19,7 @@ import numpy as np
 from kcal import Camera, load_rig, save_camera, save_rig
 from kcal.rig import Mounting
 from scripts.bench.locate_table import write_table
+from scripts.shared.children import answer
 from scripts.shared.long_range import ORIGIN, rig
 from scripts.shared.page import table
 from scripts.shared.sections import section
@@ -33,8 +32,9 @@ from pathlib import Path
 folder, size = Path(sys.argv[1]), int(sys.argv[2])
 """
 _TAIL = """
+import json
 from scripts.shared.memory import peak_megabytes
-print("measured", time.process_time(), peak_megabytes(), said, sep="|")
+print(json.dumps([f"{time.process_time():.1f}", f"{peak_megabytes():,.0f}", said]))
 """
 _TABLE = """
 from kcal.cli.main import main
@@ -224,14 +224,8 @@ def measured(step: Step, size: int) -> list[str]:
     """One row of the table."""
     with tempfile.TemporaryDirectory() as name:
         step.prepare(Path(name), size)
-        command = [sys.executable, "-c", _HEAD + step.code + _TAIL, name, str(size)]
-        threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        done = subprocess.run(command, env=os.environ | threads, capture_output=True, text=True, check=False)
-    last = done.stdout.strip().splitlines()[-1:] or [""]
-    if not last[0].startswith("measured|"):
-        return [step.title, f"{size:,}", "–", "–", (done.stderr.strip().splitlines() or ["killed"])[-1]]
-    _, seconds, peak, said = last[0].split("|", 3)
-    return [step.title, f"{size:,}", f"{float(seconds):.1f}", f"{float(peak):,.0f}", said]
+        found = answer(sys.executable, "-c", _HEAD + step.code + _TAIL, name, size)
+    return [step.title, f"{size:,}", *(["–", "–", found["failed"]] if "failed" in found else found)]
 
 
 # Megapixels and views of a quick run.

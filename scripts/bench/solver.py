@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import os
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from scripts.shared.children import answer
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.page import table
 from scripts.shared.sections import section
@@ -222,15 +222,7 @@ def judge(data: dict[str, np.ndarray], solution: dict[str, np.ndarray], coeffici
 def run(name: str, path: Path, coefficients: int, timeout: float) -> dict[str, Any]:
     python = os.environ[PYTHON[name]] if name in PYTHON else sys.executable
     code = f"from scripts.bench.solver import work; work({name!r}, {str(path)!r}, {coefficients})"
-    command, one_thread = [python, "-c", code], os.environ | {"OMP_NUM_THREADS": "1"}
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=True, env=one_thread)
-    except subprocess.TimeoutExpired:
-        return {"failed": f"> {timeout:.0f} s"}
-    except subprocess.CalledProcessError as error:
-        return {"failed": error.stderr.strip().splitlines()[-1][:60]}
-    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
-    return found
+    return answer(python, "-c", code, timeout=timeout)
 
 
 def compare(views: int, coefficients: int, repeats: int, timeout: float) -> Iterator[list[Any]]:
