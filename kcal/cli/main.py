@@ -96,9 +96,9 @@ def _global_options(
 
 # Each command, and the module here that has its function.
 COMMANDS = {
-    "demo": "demo", "init": "init", "capture": "pages", "detect": "board", "calibrate": "calibrate",
+    "demo": "demo", "init": "options", "capture": "pages", "detect": "board", "calibrate": "calibrate",
     "interpolate": "compare", "compare": "compare", "batch": "calibrate", "mark": "pages", "station": "rig",
-    "place": "rig", "stars": "stars", "locate": "locate", "live": "live", "watch": "watch", "budget": "sites",
+    "place": "rig", "stars": "stars", "locate": "locate", "live": "live", "watch": "live", "budget": "sites",
     "sites": "sites", "rectify": "rectify", "rays": "rectify", "bake": "compare", "export": "exchange",
     "import": "exchange", "schema": "exchange", "show": "show", "view": "show", "diff": "compare", "check": "report",
     "report": "report", "board print": "board", "board measure": "board", "rig solve": "rig", "rig check": "rig",

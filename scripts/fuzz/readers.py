@@ -18,8 +18,7 @@ from kcal import Observations, Origin, Rig, View, load_camera, load_rig, locate_
 from kcal.calibrate import load_measured_board, save_measured_board
 from kcal.calibrate.batch.jobs import read_jobs
 from kcal.calibrate.rig.pairs import read_pairs
-from kcal.cli.init import toml_text
-from kcal.cli.options import read_settings
+from kcal.cli.options import read_settings, toml_text
 from kcal.corners.images import read_gray, turned_images
 from kcal.corners.video import VideoFrames, read_frames
 from kcal.file_kind import file_kind

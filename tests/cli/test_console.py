@@ -29,9 +29,8 @@ from waiting import PATIENCE
 
 from kcal import Board, Camera, Observations, View, load_rig, save_camera
 from kcal.cli.console import err, out, print_styled, print_table, print_wrote, steps, warn
-from kcal.cli.init import toml_text
 from kcal.cli.main import app, main, usage_errors_shown
-from kcal.cli.options import SETTINGS, defaults_of, read_settings
+from kcal.cli.options import SETTINGS, defaults_of, read_settings, toml_text
 from kcal.errors import FileError
 from kcal.files import read_bytes, replaced, write_atomic, written_files
 from kcal.io.rig_file import save_rig
