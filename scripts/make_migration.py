@@ -89,7 +89,7 @@ def option_rows() -> list[list[str]]:
 def python_rows() -> tuple[list[list[str]], dict[str, list[str]]]:
     """Names that something replaces; and by module those that only left their door."""
     gone, there = promised("python.txt")
-    doors, replaced, moved = set(DOORS), [], dict[str, list[str]]()
+    doors, replaced, moved = set(DOORS), dict[str, list[str]](), dict[str, list[str]]()
     sources = {path: path.read_text(encoding="utf-8") for path in sorted((ROOT / "kcal").rglob("*.py"))}
     sources = {path: text for path, text in sources.items() if path.parent.name != "cli"}
     for name in sorted({line.split("(")[0].strip() for line in gone} - set(there)):
@@ -103,10 +103,10 @@ def python_rows() -> tuple[list[list[str]], dict[str, list[str]]]:
             picture = "`kcal.report.save_picture`, with a figure" if last.startswith("save_") else None
             if (new := NAMES.get(short, picture)) is None:
                 raise SystemExit(f"{name}: what became of it?")
-            replaced.append([short, new])
+            replaced.setdefault(new, []).append(short)
             continue
         moved.setdefault(".".join(places[0].relative_to(ROOT).with_suffix("").parts), []).append(last)
-    return replaced, moved
+    return sorted([", ".join(names), new] for new, names in replaced.items()), moved
 
 
 def argument_rows() -> list[list[str]]:
