@@ -14,7 +14,7 @@ FOLDER = Path(__file__).parents[1] / "docs" / "notebooks"
 def executed(path: Path) -> Any:
     """A notebook with fresh outputs, and without what differs from run to run."""
     notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}}).execute()
+    NotebookClient(notebook, timeout=1500, resources={"metadata": {"path": str(path.parent)}}).execute()
     for cell in notebook.cells:
         cell.metadata.clear()
     notebook.metadata["language_info"] = {"name": "python"}
