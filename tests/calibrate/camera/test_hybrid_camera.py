@@ -57,6 +57,7 @@ def test_finds_the_camera_with_its_error_bars() -> None:
     assert "skew" not in result.sigma
 
 
+@pytest.mark.slow
 def test_is_the_same_every_time_and_travels_as_a_file(tmp_path: Path) -> None:
     result, again = calibrated(), calibrate_camera(capture()[0])
     assert torch.equal(result.camera.params, again.camera.params)

@@ -85,12 +85,13 @@ def moved(seed: int, scale: float, center: float) -> tuple[Observations, Tensor]
 
 
 class TestGroups:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("changed", "told"),
         [
             pytest.param({"change": cropped}, r"the principal point is (3|4)\d px to the", id="cropped"),
             pytest.param({"change": zoomed(1.05)}, r"everything is (4\.\d|5\.\d) % (larger|smaller)", id="zoomed"),
-            pytest.param({"other": OTHER}, "the views are not of one camera", id="other", marks=pytest.mark.slow),
+            pytest.param({"other": OTHER}, "the views are not of one camera", id="other"),
             pytest.param({"change": turned, "lens": DECENTERED}, "turned by 180°.*back if they were", id="turned"),
         ],
     )
@@ -109,6 +110,7 @@ class TestGroups:
         if "cropped" in request.node.name:
             assert ("left", "right")[right] in text
 
+    @pytest.mark.slow
     def test_a_few_are_left_out_and_named(self) -> None:
         """The two zoomed ones, not the ten others."""
         result = calibrate_camera(capture(zoomed(1.08), second=(3, 8)))
@@ -135,6 +137,7 @@ class TestGroups:
 class TestMoves:
     """A lens that moves from view to view has a camera, whose error bars contain the movement."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("scale", "center", "told"),
         [
@@ -176,6 +179,7 @@ class TestNotAccused:
     def test_less_than_a_pixel_of_the_principal_point(self) -> None:
         assert calibrate_camera(capture(lambda pixels: pixels + 0.7)).rms < 0.1
 
+    @pytest.mark.slow
     def test_one_camera_whose_residuals_repeat_by_chance(self) -> None:
         """Tempering that another fit does without is no evidence for two cameras: 93 nats of it came from there."""
         draw = torch.Generator().manual_seed(5)
@@ -200,6 +204,7 @@ class TestNotAccused:
         seen = capture(cropped).subset(["00", "02", "04", "06", "01"])
         assert math.isfinite(calibrate_camera(seen).rms)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["st1_l", "gavin_l", "gavin_r", "sq1280"])
     def test_real_captures(self, name: str, kcal_data: Path) -> None:
         result = calibrate_camera(Observations.load(kcal_data / "captures" / f"{name}.obs.json"))
