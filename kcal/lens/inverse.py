@@ -159,6 +159,8 @@ _RINGS = 16
 # The image of the region's edge is known at 1024 directions only. A target this much farther out may still be inside:
 # it is tried at all, and it is tried again along the line from the axis.
 _TRIED, _TRIED_AGAIN = 1.0001, 1.00001
+# What has no image is put there. Where the edge has none, by rounding, it is taken for so many times the farthest.
+_FAR, _BEYOND = 1e150, 1.1
 
 
 def solve_safeguarded(
@@ -237,8 +239,9 @@ def _images(points: Tensor, lenses: Tensor, model: LensModel) -> tuple[Tensor, T
     lens = distort_components(points[..., 0], points[..., 1], lenses, model)
     regular = lens.positive & (lens.determinant > 0)
     # Images that are no part of the lens: far enough never to be the nearest, and still finite when squared.
-    far = 1e150
-    image_x, image_y = (torch.where(regular, value, far).clamp(-far, far).nan_to_num(far) for value in (lens.x, lens.y))
+    image_x, image_y = (
+        torch.where(regular, value, _FAR).clamp(-_FAR, _FAR).nan_to_num(_FAR) for value in (lens.x, lens.y)
+    )
     return image_x, image_y
 
 
@@ -249,6 +252,9 @@ def _edge_fraction(x: Tensor, y: Tensor, edge_x: Tensor, edge_y: Tensor) -> Tens
     """
     angle, order = torch.atan2(edge_y, edge_x).sort(-1)
     reach = torch.gather(torch.hypot(edge_x, edge_y), -1, order)
+    lost = reach >= _FAR
+    farthest = torch.where(lost, 0.0, reach).amax(-1, keepdim=True)
+    reach = torch.where(lost & (farthest > 0), _BEYOND * farthest, reach)
     after = torch.searchsorted(angle, torch.atan2(y, x)) % SECTORS
     before = (after - 1) % SECTORS
     limit = torch.maximum(torch.gather(reach, -1, before), torch.gather(reach, -1, after))

@@ -358,7 +358,7 @@ def _polynomial_layout(
         j, n = complex_modes[i]
         k = (n - abs(j)) // 2
         start = places[j][part].start
-        matrix[row, start : start + k + 1] = math.sqrt(n + 1) * np.array(_jacobi_coefficients(k, abs(j)))
+        matrix[row, start : start + k + 1] = math.sqrt(n + 1) * np.asarray(_jacobi_coefficients(abs(j))[k].coef, float)
     ahead, back = (range(top, -1, -1) for top in (max(0, *places), max(0, *(-j for j in places))))
     chains = tuple(places.get(j) for j in ahead), tuple(places.get(-j) if j else None for j in back)
     return chains, torch.from_numpy(matrix)
@@ -417,10 +417,9 @@ def _times_plus(value: _Complex, z: _Complex, added: _Complex, reuse: bool) -> _
 
 
 @functools.cache
-def _jacobi_coefficients(k: int, b: int) -> tuple[float, ...]:
-    """The coefficients of P_k^(0,b)(t) by rising powers of t."""
-    t = np.polynomial.Polynomial([0.0, 1.0])
-    return tuple(float(value) for value in _jacobi(k, b, t)[k].coef)
+def _jacobi_coefficients(b: int) -> list[np.polynomial.Polynomial]:
+    """P_k^(0,b)(t) for each k, by rising powers of t."""
+    return _jacobi(_HIGHEST // 2, b, np.polynomial.Polynomial([0.0, 1.0]))
 
 
 def _chebyshev(degree: int, j: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcal import Camera, InputError
 from kcal.lens import LensModel
-from kcal.lens.inverse import undistort
+from kcal.lens.inverse import _FAR, _edge_fraction, undistort
 from kcal.lens.projection import largest_radius
 from kcal.lens.region import valid_region
 from scripts.shared.distorted import distort
@@ -275,3 +275,15 @@ class TestOddInput:
             self.camera.project(torch.zeros(5, 2))
         with pytest.raises(InputError, match=r"shape \(\.\.\., 5\) is needed for opencv5"):
             distort(torch.zeros(1, 2), torch.zeros(4), "opencv5")
+
+
+def test_a_place_of_the_edge_without_an_image_opens_no_way_beyond() -> None:
+    """Rounding may leave none; pixels far beyond the others would be followed all the way from the axis."""
+    angle = torch.linspace(-math.pi, math.pi, 1025, dtype=torch.float64)[:-1]
+    edge = 2.0 * torch.stack([angle.cos(), angle.sin()])
+    edge[:, 300] = _FAR
+    at = angle[300] + torch.tensor([0.0, 0.002, 0.004], dtype=torch.float64)
+    for reach in (1.9, 2.5):
+        x, y = reach * torch.stack([at.cos(), at.sin()])
+        fraction = _edge_fraction(x[None], y[None], edge[:1], edge[1:])
+        assert bool((fraction > 1.0001).all()) == (reach > 2.2)

@@ -8,7 +8,6 @@ from collections.abc import Hashable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import torch
-from scipy.optimize import nnls
 from scipy.special import ndtri, stdtrit
 from torch import Tensor
 
@@ -78,6 +77,8 @@ class SettingSpline:
 
     def inside(self, at: Tensor) -> bool:
         """Whether a setting (D,) lies between the others: in their convex hull."""
+        from scipy.optimize import nnls  # half a second, which no other calibration needs
+
         place = torch.cat([at.new_ones(1), (at - self._low) / self._width])
         return bool(nnls(self._plane.T.numpy(), place.numpy())[1] < _SAME)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -84,13 +85,11 @@ def fit_by_options(
     start: HybridFit | FitStart | None,
     options: CalibrationOptions,
     progress: Progress,
-    robust: bool = False,
+    **how: Any,
 ) -> HybridFit:
-    """Fit a hybrid lens as the options say; arguments as of `kcal.calibrate.hybrid.fit.fit_hybrid`."""
-    own = options.of_fit(observations.image_size)
-    if robust:
-        own = dataclasses.replace(own, robust=True, training=None)
+    """Fit a hybrid lens as the options say, and as fields of `FitOptions` do; arguments as of `fit_hybrid`."""
     size = observations.image_size
+    own = dataclasses.replace(options.of_fit(size), **how)
     return fit_hybrid(observations.board.points, pixels, size, weights, own, start=start, progress=progress)
 
 
@@ -116,7 +115,7 @@ def _hybrid_without_outliers(
     pixels, names = observations.pixels(), observations.names
     own = torch.isfinite(pixels).all(-1).double()
     # A few wrong corners bend a plain fit towards them; bounded weights let them stand out.
-    robust = fit_by_options(observations, pixels, own, None, options, progress, robust=True)
+    robust = fit_by_options(observations, pixels, own, None, options, progress, robust=True, training=None)
     if options.weighted:
         own = corner_weights(observations, robust.residuals)
 

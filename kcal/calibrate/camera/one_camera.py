@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -377,15 +377,19 @@ class _Refits:
         self.step = float(step.norm())
         still = self.step <= _REST * float((theta / _widths(before.size)).norm())
         self.theta = theta + share / (1.0 - share) * (theta - self.theta)
-        self.fit = fit_by_options(self.seen, self.undone, before.weights, before, self.options, self.progress)
-        self.progress("views with a lens of their own")
+        self.fit = self._again(likely=True)
         moved = (self.fit.state.parameters - before.state.parameters)[:4]
         self.rest = still and bool((moved.abs() <= _MOVED * self.fit.covariance.diagonal()[:4].sqrt()).all())
         return _of_fit(self.fit, self.undone, self.theta)
 
+    def _again(self, **how: Any) -> HybridFit:
+        fit = fit_by_options(self.seen, self.undone, self.fit.weights, self.fit, self.options, self.progress, **how)
+        self.progress("views with a lens of their own")
+        return fit
+
     def widened(self, sigma: Tensor) -> HybridFit:
         """The last fit with error bars that allow for θ, and for that of the next view."""
-        return _widened(self.fit, self.undone, self.theta, sigma)
+        return _widened(self._again(), self.undone, self.theta, sigma)
 
     def nats(self, views: _ByView) -> float:
         """By which the last fit is likelier than the first one, were θ zero in it."""

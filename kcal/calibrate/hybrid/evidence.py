@@ -594,6 +594,8 @@ def relative_bends(data: ViewData, best: Amplitudes, families: PriorFamilies) ->
 
 # Where -ln p is taken, in standard deviations: the upper side has the long tail of <A²>.
 _PLACES = np.arange(-2.25, 4.0, 0.75)
+# Standard deviations of ln A below which half of them do: the same ½ ln <A²> to .001 (three captures by strangers).
+_SURE = 0.3
 # Directions in which -ln p does not bend are followed by no more than this standard deviation.
 _WIDEST = 2.0
 
@@ -654,14 +656,15 @@ def expected_amplitudes(
         >>> [round(float(value), 2) for value in found]
         [0.25, 0.0]
     """
-    covariance = _inverse(bend)
+    covariance, here = _inverse(bend), value(at)
     found = at.copy()
     for i in which:
         sigma = math.sqrt(covariance[i, i])
         low, high = bounds[i]
-        places = np.array([t for t in sigma * _PLACES if low <= at[i] + t <= (math.inf if high is None else high)])
+        wanted = sigma * (_PLACES[1::2] if sigma < _SURE else _PLACES)
+        places = np.array([t for t in wanted if low <= at[i] + t <= (math.inf if high is None else high)])
         along = covariance[:, i] / covariance[i, i]
-        losses = np.array([value(at + place * along) for place in places])
+        losses = np.array([value(at + place * along) if place else here for place in places])
         share = np.exp(losses.min() - losses)
         found[i] += 0.5 * math.log(float(share @ np.exp(2.0 * places)) / float(share.sum()))
     return found

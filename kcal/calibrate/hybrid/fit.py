@@ -179,6 +179,7 @@ class FitStart(NamedTuple):
         square: whether pixels are square.
         residuals: (V, N, 2) projected minus observed, pixels, weights left out; NaN where a corner did not count.
         iterations: trial steps of the solver.
+        displaced: (N, 2) meters by which corners are off their places beside the board's modes; None: not yet.
     """
 
     estimate: Estimate
@@ -186,6 +187,7 @@ class FitStart(NamedTuple):
     square: bool
     residuals: Tensor
     iterations: int
+    displaced: Tensor | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -204,6 +206,7 @@ class FitOptions:
             such a fit mean nothing; it tells which corners to leave out.
         lens: what is known of it from cameras of its type; its modes are used.
         training: of the network that the field is; None: it is not trained.
+        likely: error bars for amplitudes of largest evidence: of a fit from which another begins.
     """
 
     __repr__ = brief
@@ -218,6 +221,7 @@ class FitOptions:
     robust: bool = False
     lens: LensPrior | None = None
     training: FieldTraining | None = None
+    likely: bool = False
 
     def known_board(self, points: Tensor) -> BoardPrior | None:
         """What is known of a board (N, 3) that differs from the ordered one by more than printers err."""
@@ -251,6 +255,7 @@ def settle(
     modes = modes or ZernikeModes()
     hyperprior, exact = typical_hyperprior(modes)._replace(by_hand=len(pixels) < FEW), options.board == "exact"
     ordered, shown = points, board_modes(points)
+    moves = Readout(center=points.mean(0), distance=1.0, size=size)
     if known is not None:
         points, shown = known.applied(points, shown)
     capture = FittedViews(
@@ -260,7 +265,7 @@ def settle(
         size=size,
         weights=weights,
         hyperprior=hyperprior,
-        readout=_readout(ordered, size) if start is None and options.motion else start.readout if start else None,
+        readout=start.readout if start else moves if options.motion else None,
         square=start.square if start is not None else lens.square if lens is not None else square is True,
         robust=options.robust,
         exact=exact,
@@ -289,6 +294,10 @@ def settle(
             h[BOARD:] = hyperprior.mean[BOARD:]
         families = estimate.families.with_board(shown, len(state.board), len(h))
         estimate = estimate._replace(families=families, state=state, amplitudes=estimate.amplitudes._replace(h=h))
+        if start.displaced is not None and known is None and capture.corners:
+            capture = dataclasses.replace(capture, board=shown.with_corners())
+            estimate = estimate.with_board(capture.board)
+            estimate.state.board[-start.displaced.numel() :] = start.displaced.T.flatten()
         return run(capture, estimate, start.iterations)
     undecided = square is None and lens is None
     # Whether pixels are square is known well enough before amplitudes have converged.
@@ -353,10 +362,6 @@ def check_shown(errors: Tensor) -> None:
             "the lens cannot show all corners where they are: are all views of this board and this camera? Rejection "
             "of outliers leaves wrong views out"
         )
-
-
-def _readout(points: Tensor, size: tuple[int, int]) -> Readout:
-    return Readout(center=points.mean(0), distance=1.0, size=size)
 
 
 # Pixels that a mode can move any point by, below which it is left out.
@@ -522,7 +527,7 @@ class HybridFit:
         """A start for another fit."""
         amplitudes = Amplitudes(self.hyperparameters, self.sigma**2 / self.tempering, self.log_ratio)
         estimate = Estimate(self.model, self.families, self.state, amplitudes, self.tempering, self.relative)
-        return FitStart(estimate, self.readout, self.square, self.residuals, self.iterations)
+        return FitStart(estimate, self.readout, self.square, self.residuals, self.iterations, self.displaced)
 
     @property
     def covariance(self) -> Tensor:
@@ -565,7 +570,7 @@ def fit_hybrid(
         rounds = train_network(rounds, options.training, progress)
     capture, likely = rounds.capture, rounds.estimate
     # Error bars are for amplitudes as they are to be expected (`kcal.calibrate.hybrid.evidence`).
-    estimate = likely if robust else expected_estimate(rounds)
+    estimate = likely if robust or options.likely else expected_estimate(rounds)
     model, families, state, (h, _, log_ratio, _), tempering, relative = estimate
     variance = estimate.variance
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.

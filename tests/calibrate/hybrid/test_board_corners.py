@@ -111,6 +111,18 @@ def test_found_where_they_are_and_only_there() -> None:
     assert fit(True).log_evidence > smooth.log_evidence + 100.0
 
 
+def test_a_fit_that_begins_with_another_keeps_them() -> None:
+    """It would find them again after rounds without them."""
+    rounds = list[str]()
+    options = FitOptions(modes=MODES, motion=False, likely=True)
+    again = fit_hybrid(
+        BOARD.points, seen(1, PLANTED).pixels(), SIZE, options=options, start=fit(True), progress=rounds.append
+    )
+    assert len(rounds) <= 2
+    assert agreement(again.displaced, PLANTED) == pytest.approx(agreement(fit(True).displaced, PLANTED), abs=2e-3)
+    assert again.expected.tolist() == again.hyperparameters.tolist()
+
+
 def test_an_exact_board_has_none() -> None:
     options = FitOptions(modes=MODES, board="exact", motion=False)
     assert fit_hybrid(BOARD.points, seen(1, PLANTED).pixels(), SIZE, options=options).displaced is None

@@ -247,9 +247,13 @@ def smallest(loss: Loss) -> np.ndarray:
     return np.array([best, 0.0, 0.0])
 
 
-@pytest.mark.parametrize("sizes", [[1.0, -0.8, 1.2, 0.7, -1.1], [0.3, -0.1, 0.2], [0.01, 0.02]])
-def test_mean_square_is_that_of_the_integral(sizes: list[float]) -> None:
-    """Where the amplitude is well determined, where it is not, and where nothing but an upper bound is known."""
+@pytest.mark.parametrize(
+    ("sizes", "within"),
+    [([1.0, -0.8, 1.2, 0.7, -1.1] * 6, 0.002), ([1.0, -0.8, 1.2, 0.7, -1.1], 0.15), ([0.3, -0.1, 0.2], 0.15),
+     ([0.01, 0.02], 0.15)],
+)  # fmt: skip
+def test_mean_square_is_that_of_the_integral(sizes: list[float], within: float) -> None:
+    """Where the amplitude is known surely, well, hardly, and where nothing but an upper bound is known."""
     loss = weights_seen(sizes, 0.2)
     at = smallest(loss)
     found = expected_amplitudes(bend(loss, at), value_of(loss), at, [0], WIDE)
@@ -259,7 +263,7 @@ def test_mean_square_is_that_of_the_integral(sizes: list[float]) -> None:
 
     total, square = (integrate.quad(density, -12.0, 8.0, args=(p,), limit=200)[0] for p in (0.0, 2.0))
     # Nine places along a skewed density: the smallest case is the widest.
-    assert found[0] == pytest.approx(0.5 * math.log(square / total), abs=0.15)
+    assert found[0] == pytest.approx(0.5 * math.log(square / total), abs=within)
     assert found[0] > at[0]
     assert found[1:].tolist() == at[1:].tolist()
 
