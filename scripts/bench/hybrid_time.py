@@ -1,4 +1,4 @@
-"""Processor time and memory of the default camera, beside 14 coefficients, Ceres and mrcal's splines.
+"""Processor time and memory of the default camera, beside OpenCV, 14 coefficients, Ceres and mrcal's splines.
 
 KCAL_PEERS names an interpreter that has pyceres, KCAL_MRCAL one that has mrcal. Views as in `scripts.bench.solver`:
 6 x 7 corners, 0.2 px of noise. Each run is a process of its own, warmed up on eight views; runs alternate. Ceres begins
@@ -7,6 +7,7 @@ at a good start that is not timed.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import statistics
@@ -20,45 +21,71 @@ from typing import Any
 
 import numpy as np
 
-from kcal.corners.board import Board
+from kcal.corners.observations import Observations
+from kcal.errors import KcalError
 from scripts.bench import solver
 from scripts.shared.children import answer
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import table
+from scripts.shared.peer_lenses import calibrated
+from scripts.shared.real_captures import load, names
 from scripts.shared.sections import section
-from scripts.shared.views import COLUMNS, ROWS, SIZE, SQUARE, observed, simulate
+from scripts.shared.views import observed, simulate
 
-SPLINE = "SPLINED13x9"
+SPLINE, FEWER = "SPLINED13x9", "SPLINED11x8"
 DEFAULT, MANY, SINGLE = "default camera", "one call", "single calls"
+TYPED = "kcal calibrate, with picture and page"
+OPENCV, ONE_THREAD = "OpenCV, 8 coefficients", {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
-def work(way: str, views: int, cameras: int) -> None:
+def work(way: str, views: int | str, cameras: int) -> None:
     """In a process of its own: calibrate, and print processor seconds and peak memory."""
     from kcal.calibrate.camera.calibrate import calibrate_camera, calibrate_cameras
 
-    sets = [observed(simulate(views, seed=50_000 + i)["pixels"].tolist()) for i in range(cameras)]
+    if isinstance(views, str):
+        sets = [load(views).seen]
+    else:
+        sets = [observed(simulate(views, seed=50_000 + i)["pixels"].tolist()) for i in range(cameras)]
     calibrate_camera(observed(simulate(8)["pixels"].tolist()))
     before, start = peak_megabytes(), time.process_time()
     if way == MANY:
         calibrate_cameras(sets)
-    else:
-        for seen in sets:
+    for seen in sets * (way != MANY):
+        if way == OPENCV:
+            calibrated(seen, 8)
+            continue
+        with contextlib.suppress(KcalError):
             calibrate_camera(seen)
     print(json.dumps({"seconds": time.process_time() - start, "megabytes": peak_megabytes(), "before": before}))
 
 
-def own(way: str, views: int, cameras: int = 1) -> dict[str, Any]:
-    code = f"from scripts.bench.hybrid_time import work; work({way!r}, {views}, {cameras})"
+def own(way: str, views: int | str, cameras: int = 1) -> dict[str, Any]:
+    code = f"from scripts.bench.hybrid_time import work; work({way!r}, {views!r}, {cameras})"
     return answer(sys.executable, "-c", code)
 
 
-def spline(data: dict[str, np.ndarray], timeout: float) -> dict[str, Any]:
+def typed(seen: Observations) -> dict[str, Any]:
+    """`kcal calibrate` with picture and page, start-up included."""
+    with tempfile.TemporaryDirectory() as folder:
+        views, camera, picture, page = (str(Path(folder, name)) for name in ("obs.json", "c.json", "c.png", "c.html"))
+        seen.save(views)
+        words = ["calibrate", views, "-o", camera, "--picture", picture, "--report", page]
+        before = os.times()
+        subprocess.run([sys.executable, "-m", "kcal", *words], capture_output=True, env=os.environ | ONE_THREAD)
+        after = os.times()
+    spent = after.children_user + after.children_system - before.children_user - before.children_system
+    return {"seconds": spent}
+
+
+def spline(lens: str, seen: Observations, focal: float, timeout: float) -> dict[str, Any]:
     """Mrcal's splined lens, with no view held out."""
-    board, none = Board(columns=COLUMNS, rows=ROWS, square=SQUARE), np.arange(0)
-    weight = np.ones(data["pixels"].shape[:2])
+    pixels, none = seen.pixels().numpy(), np.arange(0)
+    weight = np.isfinite(pixels).all(-1).astype(float)
     try:
-        found = splined(SPLINE, data["pixels"], weight, none, size=SIZE, board=board, focal=1500.0, timeout=timeout)
+        found = splined(
+            lens, pixels, weight, none, size=seen.image_size, board=seen.board, focal=focal, timeout=timeout
+        )
     except subprocess.TimeoutExpired:
         return {"failed": f"> {timeout:.0f} s"}
     except subprocess.CalledProcessError as error:
@@ -79,7 +106,8 @@ def compare(views: int, repeats: int, timeout: float) -> list[Any]:
             for name in others:
                 runs.setdefault(name, []).append(solver.run(name, path, 14, timeout))
             if os.environ.get("KCAL_MRCAL"):
-                runs.setdefault(SPLINE, []).append(spline(data, timeout))
+                seen = observed(data["pixels"].tolist())
+                runs.setdefault(SPLINE, []).append(spline(SPLINE, seen, 1500.0, timeout))
     cells: list[Any] = [views]
     first = [run["seconds"] for run in runs[DEFAULT]]
     for found in runs.values():
@@ -101,6 +129,31 @@ def time_of_fits(
     header += ["Ceres, 14 coefficients"] if os.environ.get("KCAL_PEERS") else []
     header += [f"mrcal, {SPLINE}"] if os.environ.get("KCAL_MRCAL") else []
     return table([*header, "peak memory of the default"], (compare(count, repeats, timeout) for count in views))
+
+
+@section("one-camera.md", "captures", captures=("ch1280",))
+def time_of_captures(captures: tuple[str, ...] = ("all",), timeout: float = 300.0) -> Iterator[str]:
+    """Captures by strangers; in brackets the default camera's time over the other's."""
+    mrcal, rows = os.environ.get("KCAL_MRCAL"), list[list[Any]]()
+    ratios, sums = dict[str, list[float]](), [0.0, 0.0]
+    for name in names() if captures == ("all",) else captures:
+        seen = load(name).seen
+        found = {DEFAULT: own(DEFAULT, name), TYPED: typed(seen), OPENCV: own(OPENCV, name)}
+        if mrcal and seen.board.pattern == "checkerboard":
+            found[FEWER] = spline(FEWER, seen, 0.7 * seen.image_size[0], timeout)
+        first = found[DEFAULT]["seconds"]
+        sums = [sums[0] + first, sums[1] + found[TYPED]["seconds"]]
+        cells = [f"{first:.2f} s", f"{found[TYPED]['seconds']:.1f} s"]
+        for other in [OPENCV, *[FEWER] * bool(mrcal)]:
+            spent = found.get(other, {"failed": "–"})
+            if "failed" not in spent:
+                ratios.setdefault(other, []).append(first / spent["seconds"])
+            cells.append(spent.get("failed") or f"{spent['seconds']:.3f} s ({ratios[other][-1]:.0f})")
+        rows.append([name, len(seen.views), int(seen.pixels().isfinite().all(-1).sum()), *cells])
+    middle = [f"median {statistics.median(ratios[each]):.0f}" for each in ratios]
+    rows.append(["all", "", "", f"{sums[0]:.1f} s", f"{sums[1]:.1f} s", *middle])
+    heads = ["capture", "views", "corners", DEFAULT, TYPED, OPENCV, *[f"mrcal, {FEWER}"] * bool(mrcal)]
+    yield from table(heads, rows)
 
 
 @section("one-camera.md", "many", cameras=2, each=6)
