@@ -234,7 +234,7 @@ class _Option:
     def value(self, given: Any) -> Any:
         """What the command gets."""
         if given != given:
-            raise typer.BadParameter(f"{self.label}: a number is needed, not nan")
+            raise InputError(f"{self.label}: a number is needed, not nan")
         if self.kind.read is None or given is None:
             return given
         if not isinstance(given, list | tuple):
