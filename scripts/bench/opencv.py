@@ -24,16 +24,12 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.report.judge_rig import triangulated_sides
 from kcal.rig import pair_by_name
 from scripts.shared.page import table
+from scripts.shared.peer_lenses import calibrated
 from scripts.shared.real_captures import stereo_images
 from scripts.shared.sections import section
 
 CRITERIA = (3, 300, 1e-12)
-FLAGS = {
-    "opencv5": 0,
-    "opencv8": cv2.CALIB_RATIONAL_MODEL,
-    "opencv12": cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL,
-    "opencv14": cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL,
-}
+MODELS = ("opencv5", "opencv8", "opencv12", "opencv14")
 
 
 @functools.cache
@@ -69,12 +65,15 @@ def projection() -> Iterator[str]:
 
 
 @section("other-programs.md", "opencv, cameras", repeats=1, models=("opencv5",))
-def cameras(repeats: int = 5, models: tuple[str, ...] = tuple(FLAGS)) -> Iterator[str]:
+def cameras(repeats: int = 5, models: tuple[str, ...] = MODELS) -> Iterator[str]:
     rows = []
     for side, model in itertools.product(("left", "right"), models):
         options = CalibrationOptions(model=model, weak_prior=None, weighted=False)
         seen = _observe(side)
-        ours, theirs, times = _in_turn(partial(calibrate_camera, seen, options), partial(_opencv, seen, model), repeats)
+        count = int(model.removeprefix("opencv"))
+        ours, theirs, times = _in_turn(
+            partial(calibrate_camera, seen, options), partial(calibrated, seen, count, criteria=CRITERIA), repeats
+        )
         ratios = [a / b for a, b in zip(*times, strict=True)]
         rows.append([
             side, model, f"{ours.rms:.7f}", f"{theirs[0]:.7f}", f"{ours.rms - theirs[0]:+.1e}",
@@ -109,12 +108,6 @@ def _points(observations: Observations, also: Observations | None = None) -> tup
         seen = seen & torch.isfinite(also.pixels()).all(-1)
     board = observations.board.points.float()
     return [board[s].numpy() for s in seen], [p[s].float().numpy() for p, s in zip(pixels, seen, strict=True)]
-
-
-def _opencv(observations: Observations, model: str) -> Any:
-    boards, pixels = _points(observations)
-    size = observations.image_size
-    return cv2.calibrateCamera(boards, pixels, size, None, None, flags=FLAGS[model], criteria=CRITERIA)
 
 
 @section("other-programs.md", "opencv, rig", repeats=1)

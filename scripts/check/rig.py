@@ -74,10 +74,10 @@ def landmarks(draw: torch.Generator, count: int = 12) -> Landmarks:
     )
 
 
-def summits(draw: torch.Generator, count: int = 20, known: float = 0.1) -> Features:
+def summits(draw: torch.Generator, count: int = 20) -> Features:
     points = spread(count, 8000.0, 40_000.0, draw)
     inverse = 1.0 / torch.linalg.vector_norm(points - CENTER.mean(0), dim=-1)
-    sigma = known * inverse
+    sigma = 0.1 * inverse
     return Features(
         names=tuple(f"summit {i}" for i in range(1, count + 1)),
         pixels=seen(points) + MARK * normal((count, 2, 2), draw),

@@ -107,7 +107,7 @@ def owner(tracks: Tracks, site: Site, places: Tensor) -> Tensor:
     return torch.cdist(tracks.state.bearing, direction).argmin(-1)
 
 
-def gospa(found: Tensor, true: Tensor, cutoff: float, power: float = 2.0) -> float:
+def gospa(found: Tensor, true: Tensor, cutoff: float) -> float:
     """Generalized optimal sub-pattern assignment (Rahmathullah et al. 2017), alpha = 2.
 
     Example:
@@ -116,12 +116,12 @@ def gospa(found: Tensor, true: Tensor, cutoff: float, power: float = 2.0) -> flo
     """
     from scipy.optimize import linear_sum_assignment
 
-    cost = torch.cdist(found, true).clamp_max(cutoff).numpy() ** power
+    cost = torch.cdist(found, true).clamp_max(cutoff).numpy() ** 2
     rows, columns = linear_sum_assignment(cost)
     matched = cost[rows, columns]
-    real = matched < cutoff**power
+    real = matched < cutoff**2
     alone = len(found) + len(true) - 2 * int(real.sum())
-    return float((matched[real].sum() + cutoff**power / 2 * alone) ** (1 / power))
+    return math.sqrt(float(matched[real].sum() + cutoff**2 / 2 * alone))
 
 
 class Figures:

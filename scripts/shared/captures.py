@@ -13,7 +13,6 @@ from kcal.sim.captures import (
     BoardLike,
     BoardSize,
     LensLike,
-    PoseOptions,
     board_points,
     project_board,
     sample_board_poses,
@@ -49,7 +48,6 @@ def capture_corners(
     seed: int,
     board: BoardLike = PAPER_BOARD,
     fill: tuple[float, float] = (0.25, 0.8),
-    options: PoseOptions | None = None,
 ) -> Capture:
     """Simulate the corners of a board in poses that cover the image, with Gaussian noise.
 
@@ -60,7 +58,6 @@ def capture_corners(
         seed: of poses and noise; another sigma scales the same noise.
         board: its size.
         fill: smallest and largest share of the image's width or height that the board takes.
-        options: limits of tilt, roll and margins.
 
     Raises:
         InputError: see `sample_board_poses`; or a sigma that is negative.
@@ -68,7 +65,7 @@ def capture_corners(
     if not 0 <= sigma < math.inf:
         raise InputError(f"sigma {sigma}: pixels, not negative, are needed")
     generator = torch.Generator().manual_seed(seed)
-    poses = sample_board_poses(lens, board, views, generator, fill=fill, options=options)
+    poses = sample_board_poses(lens, board, views, generator, fill=fill)
     true = torch.stack([project_board(lens, pose, board)[0] for pose in poses])
     noise = torch.randn(true.shape, dtype=torch.float64, generator=generator)
     return Capture(

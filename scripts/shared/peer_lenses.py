@@ -11,14 +11,15 @@ import numpy as np
 from kcal import Camera, Observations
 
 FLAGS = {5: 0, 8: cv2.CALIB_RATIONAL_MODEL}
-FLAGS[14] = FLAGS[8] | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL
+FLAGS[12] = FLAGS[8] | cv2.CALIB_THIN_PRISM_MODEL
+FLAGS[14] = FLAGS[12] | cv2.CALIB_TILTED_MODEL
 END = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 1000, 1e-12)
 
 
 def calibrated(
     seen: Observations, coefficients: int, *, release: bool = False, **options: Any
 ) -> tuple[float, Any, Any]:
-    """RMS, matrix and 5, 8 or 14 coefficients of `cv2.calibrateCamera`; `release`: of `cv2.calibrateCameraRO`.
+    """RMS, matrix and 5, 8, 12 or 14 coefficients of `cv2.calibrateCamera`; `release`: of `cv2.calibrateCameraRO`.
 
     Raises:
         cv2.error: OpenCV failed.

@@ -78,7 +78,7 @@ def exact_camera(number: int) -> Camera:
     return as_camera(lens_of(number))
 
 
-def site_of(seed: int, trees: float = 0.0, refraction_sigma: float = 0.1) -> Site:
+def site_of(seed: int, trees: float = 0.0) -> Site:
     """A site of a seed: terrain, attitude, air."""
     random = np.random.default_rng([seed, 5])
     hills = Hills(seed=seed, relief=float(random.uniform(250, 600)), far=9_500.0, trees=trees, woods=0.33)
@@ -87,7 +87,7 @@ def site_of(seed: int, trees: float = 0.0, refraction_sigma: float = 0.1) -> Sit
     eye = np.array([0.0, 0.0, float(hills.ground(nowhere, nowhere)[0]) + MAST])
     air = HillWeather(
         haze=float(random.uniform(8_000, 30_000)),
-        refraction=0.13 + refraction_sigma * float(random.standard_normal()),
+        refraction=0.13 + 0.1 * float(random.standard_normal()),
         clouds=float(random.uniform(0.0, 0.8)),
         noise=float(random.uniform(0.7, 2.5)),
         seed=seed,

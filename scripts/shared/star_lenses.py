@@ -25,7 +25,7 @@ from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.simulated import CHI2, LENSES
 from scripts.shared.traced import BOARD, capture, printed
 
-SIZE = (1280, 800)
+SIZE, STAR = (1280, 800), 0.1  # px
 LENSES_FROM = ["boards", *(f"{what}, {where}" for where in ("level", "tilted 30°")
                            for what in ("stars", "boards and stars"))]  # fmt: skip
 # Shares of the image that boards fill.
@@ -42,7 +42,7 @@ def true_lens() -> Camera:
 
 
 def star_images(
-    tilt: float, images: int, seed: int, sigma: float = 0.1, faintest: float = 5.0, lens: LensLike | None = None
+    tilt: float, images: int, seed: int, faintest: float = 5.0, lens: LensLike | None = None
 ) -> tuple[list[DetectedStars], list[SkyView]]:
     """Stars of images of one fixed camera over a night, with noise, and five points that are no stars in each.
 
@@ -50,7 +50,6 @@ def star_images(
         tilt: degrees above the horizon of the middle of the image.
         images: how many, 25 minutes apart.
         seed: of the noise.
-        sigma: of a star, px.
         faintest: magnitude.
         lens: that of `true_lens` if left out.
     """
@@ -66,11 +65,11 @@ def star_images(
         index, rays = index[ahead], rays[ahead]
         at, valid = camera.project(FAR * rays)
         good = (valid & camera.inside(at)).numpy()
-        pixels = at.numpy()[good] + draw.normal(0, sigma, (int(good.sum()), 2))
+        pixels = at.numpy()[good] + draw.normal(0, STAR, (int(good.sum()), 2))
         flux = 10 ** (-0.4 * catalog.magnitude[index[good]])
         none = draw.uniform(0, 1, (5, 2)) * camera.size
         pixels, flux = np.concatenate([pixels, none]), np.concatenate([flux, np.full(5, flux.min())])
-        found.append(DetectedStars(pixels, np.full(len(pixels), sigma), flux, 0.02, {}))
+        found.append(DetectedStars(pixels, np.full(len(pixels), STAR), flux, 0.02, {}))
         views.append(SkyView(time=time, origin=PLACE))
     return found, views
 

@@ -18,7 +18,7 @@ from kcal.stars.sky import EARTH_RATE, StarCatalog, observed_directions, pole_in
 from scripts.shared.long_range import matches_of
 from scripts.shared.night_scenes import PLACE, TIME
 
-BASELINE = 10.0
+BASELINE, STAR = 10.0, 0.1  # m, px
 LOOKS = ((40.0, 12.0, 1.0), (41.5, 12.5, -0.5))
 
 
@@ -28,7 +28,6 @@ def star_rig(
     seed: int,
     named: bool,
     moments: int = 1,
-    sigma: float = 0.1,
     clock: float = 0.0,
     clock_sigma: float = 0.02,
     drift: float = 0.0,
@@ -44,7 +43,6 @@ def star_rig(
         seed: of all noise.
         named: stars with directions, or without.
         moments: pairs of images, 25 minutes apart.
-        sigma: of a star, px.
         clock: seconds by which the second camera's images are late.
         clock_sigma: as stated.
         drift: seconds an hour by which it is later and later.
@@ -80,8 +78,8 @@ def star_rig(
         effects.append(Effect(name="its drift", turn=each * drift_sigma / clock_sigma, factor=hours))
     stars = StarSource(
         names=tuple(names),
-        pixels=clean + torch.from_numpy(draw.normal(0, sigma, clean.shape)),
-        pixel_sigma=torch.full(clean.shape[:2], sigma).double(),
+        pixels=clean + torch.from_numpy(draw.normal(0, STAR, clean.shape)),
+        pixel_sigma=torch.full(clean.shape[:2], STAR).double(),
         direction=known if named else torch.full_like(known, torch.nan),
         direction_sigma=torch.full((len(names),), 5e-6 if named else math.inf).double(),
         effects=tuple(effects),
