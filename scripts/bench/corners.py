@@ -27,6 +27,7 @@ from kcal.corners.saddle import saddle
 from kcal.lens import rotation_from_vector
 from kcal.sim.captures import BoardSize, project_board
 from kcal.sim.scene import RenderOptions, render_light
+from scripts.bench.found import by_sector
 from scripts.shared.page import table
 from scripts.shared.real_captures import stereo_images
 from scripts.shared.sections import section
@@ -112,9 +113,7 @@ def fixed_window(half: int) -> Callable[[Image, Tensor, Tensor], Tensor]:
 
 def sector(image: Image, start: Tensor, side: Tensor) -> Tensor:
     """`findChessboardCornersSB` from nothing, its corners in the order of the starts."""
-    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-    found, corners = cv2.findChessboardCornersSB(image, (BOARD.columns, BOARD.rows), flags=flags)
-    if not found:
+    if (corners := by_sector(image, BOARD)) is None:
         return torch.full_like(start, math.nan)
     pixels = torch.from_numpy(corners.reshape(-1, 2).astype(np.float64))
     nearest = torch.cdist(start, pixels).argmin(1)
