@@ -34,7 +34,7 @@ from scripts.shared.timing import children_seconds, show
 ROOT = Path(__file__).parent
 # Packages whose versions change what is measured, and modules of others, which count where a section loaded them.
 _TOLD = ("torch", "numpy", "scipy", "opencv-contrib-python-headless", "kornia")
-_PEERS = ("stonesoup", "onnxruntime", "pycolmap", "gtsam", "aniposelib", "Pose2Sim", "av", "rasterio", "erfa", "mpmath")
+_PEERS = ("stonesoup", "onnxruntime", "pycolmap", "gtsam", "aniposelib", "Pose2Sim", "av", "rasterio", "erfa")
 
 
 def load(page: str) -> list[Section]:
