@@ -60,40 +60,6 @@ class KnownViews(NamedTuple):
     by_lens: Tensor
 
 
-class ViewRows(NamedTuple):
-    """N points of M = 2 C pixel coordinates; the last axis counts points.
-
-    Attributes:
-        anchor: (N,) number of the camera from which a point is told; the first one where nobody saw it.
-        place: (3, N) its center.
-        direction: (3, N) unit vectors in the frame.
-        sides: two (3, N) across it.
-        inverse: (N,) one over meters; zero where lines of sight do not meet ahead.
-        jacobian: (M, 3, N) pixels by steps along the sides and by the inverse distance; zeros of views that do not
-            count.
-        residual: (M, N) predicted minus measured.
-        shared: (M, K + 1, N) pixels by each common error, and by k / 2R.
-        white: (M, M, N) U⁻¹ of the covariance U Uᵀ of the pixels, U upper triangular; that of views that do not count
-            is the identity.
-        used: (C, N) which views count.
-        alone: (N,) one view counts.
-        fitted: (N,) the lines of sight exist.
-    """
-
-    anchor: Tensor
-    place: Tensor
-    direction: Tensor
-    sides: tuple[Tensor, Tensor]
-    inverse: Tensor
-    jacobian: Tensor
-    residual: Tensor
-    shared: Tensor
-    white: Tensor
-    used: Tensor
-    alone: Tensor
-    fitted: Tensor
-
-
 @torch.no_grad()
 def known_views(posed: PosedCameras, common: CommonErrors | None) -> KnownViews:
     """Prepare cameras, and what is not known of them."""
@@ -119,86 +85,11 @@ def known_views(posed: PosedCameras, common: CommonErrors | None) -> KnownViews:
     )  # fmt: skip
 
 
-@torch.no_grad()
-def view_rows(known: KnownViews, pixels: Tensor, seen: Tensor, covariance: Tensor) -> ViewRows:
-    """Linear rows of objects.
-
-    Args:
-        known: the cameras.
-        pixels: (N, C, 2) float64, finite where seen.
-        seen: (N, C) bool; what is False is not read.
-        covariance: (N, 2 C, 2 C) of the pixels of a row, px².
-    """
-    posed, cameras = known.posed, len(known.middle)
-    pixels = torch.where(seen[..., None], pixels, known.middle)
-    blocks = covariance.unflatten(-1, (cameras, 2)).unflatten(-3, (cameras, 2)).diagonal(dim1=-4, dim2=-2)
-    sound = sound_covariances(blocks.movedim(-1, 1))
-    marks = pixels.movedim(0, 1)  # (C, N, 2)
-    rays, valid = unproject_each(known.stack, marks)
-    shifted = pixels + 0.5
-    inside = ((shifted >= 0.0) & (shifted <= known.size)).all(-1)
-    used = seen & valid.T & inside & sound
-    count = used.sum(-1)
-    alone = count == 1
-    fitted = alone | ((count > 1) & ~(seen & ~sound).any(-1))
-    anchor = first_seen(used).to(torch.int64).argmax(-1)
-    in_frame = rays @ posed.rotation
-    place = posed.center.T.index_select(1, anchor)
-    ray = in_frame[anchor, torch.arange(len(anchor), device=anchor.device)].T
-    if known.axes is not None:
-        both = in_frame @ known.axes
-        found = meeting_points(both[0], both[1], known.axes, known.baseline)
-    elif cameras > 1:
-        found = triangulate_angular(known.matrices, rays.movedim(0, 1), used)
-    else:
-        found = Found(torch.zeros_like(ray.T), torch.zeros_like(alone))
-    away = torch.where(alone, ALONE_M * ray, found.points.T + (posed.center[0, :, None] - place))
-    met = alone | (found.valid & (count > 1))
-    away = torch.where(met, away, ray)
-    nearness = away.square().sum(0).rsqrt()
-    ahead, inverse = away * nearness, nearness * met
-    first, second = (side.T for side in side_axes(ahead.T))
-
-    # Axes of each camera: (C, 3, 3 columns, N), and what a larger inverse distance adds.
-    turned = (posed.rotation @ torch.stack([first, second, ahead], 1).flatten(1)).unflatten(-1, (3, -1))
-    shift = posed.rotation @ (place - posed.center[..., None])
-    at = turned[:, :, 2] + inverse * shift
-    along = (at * known.up).sum(1, keepdim=True)
-    lift = (at.square().sum(1, keepdim=True) - along * along) / inverse.clamp_min(1.0 / LIGHT_HORIZON)
-    at = at + (posed.bending * lift) * known.up
-    counts = used.T & fitted
-    good = counts & ((at[:, 2] > 1e-6) | known.wide)
-    # The axis is a harmless stand-in.
-    at = torch.where(good[:, None], at, at.new_tensor([[0.0], [0.0], [1.0]]))
-    projected = project_stack(known.stack, at, known.lens, inverse)
-    by_point, share = projected.by_point, counts.to(at.dtype)[:, None]
-    columns = torch.cat([turned[:, :, :2], shift[:, :, None]], 2)
-    jacobian = (columns[:, :, :, None] * by_point[:, :, None]).sum(1)  # (C, 3 columns, 2, N)
-    if projected.by_meter is not None:
-        jacobian = jacobian + torch.nn.functional.pad(projected.by_meter[:, None], (0, 0, 0, 0, 2, 0))
-    point = torch.cat([at, inverse.expand_as(lift), lift], 1)
-    moved = (known.moves @ point).unflatten(1, (-1, 3))  # (C, K + 1, 3, N)
-    shared = (moved[:, :, :, None] * by_point[:, None]).sum(2)
-    if known.by_lens.shape[-1]:
-        shared = shared + (known.by_lens @ projected.by_camera.flatten(2)).unflatten(-1, (2, -1))
-    return ViewRows(
-        anchor,
-        place,
-        ahead,
-        (first, second),
-        inverse,
-        (share[:, :, None] * jacobian).transpose(1, 2).flatten(0, 1),
-        (share * (projected.pixels - marks.mT)).flatten(0, 1),
-        (share[:, :, None] * shared).transpose(1, 2).flatten(0, 1),
-        _whitening(covariance, used),
-        used.T,
-        alone,
-        fitted,
-    )
-
-
 def _whitening(covariance: Tensor, used: Tensor) -> Tensor:
-    """`ViewRows.white`; the identity where the covariance of all pixels of a row is none."""
+    """(M, M, N) U⁻¹ of covariances U Uᵀ, U upper triangular; the identity for views that do not count, or none of them.
+
+    So views that do not count have rows of zeros beside a noise of one.
+    """
     still = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
     both = used[..., None].expand(-1, -1, 2).flatten(1)
     whole = torch.where(both[:, :, None] & both[:, None], covariance, still)
@@ -370,33 +261,84 @@ def sightings(
         lasting_px: standard deviation along each axis of errors that stay as long as a target, in the marks of all
             cameras but the first.
     """
-    rows = view_rows(known, pixels, seen, covariance)
-    white, used, cameras = rows.white, rows.used, len(rows.used)
+    posed, cameras = known.posed, len(known.middle)
+    pixels = torch.where(seen[..., None], pixels, known.middle)
+    blocks = covariance.unflatten(-1, (cameras, 2)).unflatten(-3, (cameras, 2)).diagonal(dim1=-4, dim2=-2)
+    sound = sound_covariances(blocks.movedim(-1, 1))
+    marks = pixels.movedim(0, 1)  # (C, N, 2)
+    rays, valid = unproject_each(known.stack, marks)
+    shifted = pixels + 0.5
+    inside = ((shifted >= 0.0) & (shifted <= known.size)).all(-1)
+    used = seen & valid.T & inside & sound
+    count = used.sum(-1)
+    alone = count == 1
+    fitted = alone | ((count > 1) & ~(seen & ~sound).any(-1))
+    anchor = first_seen(used).to(torch.int64).argmax(-1)
+    in_frame = rays @ posed.rotation
+    place = posed.center.T.index_select(1, anchor)
+    ray = in_frame[anchor, torch.arange(len(anchor), device=anchor.device)].T
+    if known.axes is not None:
+        both = in_frame @ known.axes
+        found = meeting_points(both[0], both[1], known.axes, known.baseline)
+    elif cameras > 1:
+        found = triangulate_angular(known.matrices, rays.movedim(0, 1), used)
+    else:
+        found = Found(torch.zeros_like(ray.T), torch.zeros_like(alone))
+    away = torch.where(alone, ALONE_M * ray, found.points.T + (posed.center[0, :, None] - place))
+    met = alone | (found.valid & (count > 1))
+    away = torch.where(met, away, ray)
+    nearness = away.square().sum(0).rsqrt()
+    ahead, inverse = away * nearness, nearness * met
+    first, second = (side.T for side in side_axes(ahead.T))
+
+    # Axes of each camera: (C, 3, 3 columns, N), and what a larger inverse distance adds.
+    turned = (posed.rotation @ torch.stack([first, second, ahead], 1).flatten(1)).unflatten(-1, (3, -1))
+    shift = posed.rotation @ (place - posed.center[..., None])
+    at = turned[:, :, 2] + inverse * shift
+    along = (at * known.up).sum(1, keepdim=True)
+    lift = (at.square().sum(1, keepdim=True) - along * along) / inverse.clamp_min(1.0 / LIGHT_HORIZON)
+    at = at + (posed.bending * lift) * known.up
+    counts = used.T & fitted
+    good = counts & ((at[:, 2] > 1e-6) | known.wide)
+    # The axis is a harmless stand-in.
+    at = torch.where(good[:, None], at, at.new_tensor([[0.0], [0.0], [1.0]]))
+    projected = project_stack(known.stack, at, known.lens, inverse)
+    by_point, share = projected.by_point, counts.to(at.dtype)[:, None]
+    columns = torch.cat([turned[:, :, :2], shift[:, :, None]], 2)
+    jacobian = (columns[:, :, :, None] * by_point[:, :, None]).sum(1)  # (C, 3 columns, 2, N)
+    if projected.by_meter is not None:
+        jacobian = jacobian + torch.nn.functional.pad(projected.by_meter[:, None], (0, 0, 0, 0, 2, 0))
+    point = torch.cat([at, inverse.expand_as(lift), lift], 1)
+    moved = (known.moves @ point).unflatten(1, (-1, 3))  # (C, K + 1, 3, N)
+    shared = (moved[:, :, :, None] * by_point[:, None]).sum(2)
+    if known.by_lens.shape[-1]:
+        shared = shared + (known.by_lens @ projected.by_camera.flatten(2)).unflatten(-1, (2, -1))
+    white = _whitening(covariance, used)
     each = white.unflatten(1, (cameras, 2)).transpose(0, 1)  # (V, M, 2, N)
-    late = (each[:, :, :, None] * rows.jacobian.unflatten(0, (cameras, 2))[:, None]).sum(2)
-    # Of the common errors, of the residual, and of what light bends.
-    changes = torch.cat([rows.shared, rows.residual[:, None]], 1)
+    late = (each[:, :, :, None] * (share[:, :, None] * jacobian).transpose(1, 2)[:, None]).sum(2)
+    # Of the common errors, of what light bends, and of what is predicted beside what was measured.
+    changes = torch.cat([shared, (projected.pixels - marks.mT)[:, None]], 1)
+    changes = (share[:, :, None] * changes).transpose(1, 2).flatten(0, 1)
     shared, more, value = (-product(white, changes)).split([changes.shape[1] - 2, 1, 1], 1)
     if lasting_px:
         shared = torch.cat([shared, lasting_px * white[:, 2:]], 1)
-    first, second = rows.sides
     clock = time.T
     row = pixels[..., 1].T / known.size[:, 1:] - 0.5
     return Sightings(
-        anchor=rows.anchor,
-        place=rows.place,
-        direction=rows.direction,
-        inverse=rows.inverse,
-        by_ray=torch.stack([first, second, -rows.inverse * rows.direction]),
+        anchor=anchor,
+        place=place,
+        direction=ahead,
+        inverse=inverse,
+        by_ray=torch.stack([first, second, -inverse * ahead]),
         value=value[:, 0],
         late=late,
         shared=shared,
-        bent=torch.where(rows.alone, more[:, 0] / -ALONE_M, 0.0),
-        time=torch.where(used, clock, clock.gather(0, rows.anchor[None])),
-        row=torch.where(used, row, 0.0),
-        seen=used,
-        alone=rows.alone,
-        usable=rows.fitted,
+        bent=torch.where(alone, more[:, 0] / -ALONE_M, 0.0),
+        time=torch.where(used.T, clock, clock.gather(0, anchor[None])),
+        row=torch.where(used.T, row, 0.0),
+        seen=used.T,
+        alone=alone,
+        usable=fitted,
     )
 
 

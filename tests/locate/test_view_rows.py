@@ -7,7 +7,7 @@ import torch
 from kcal import Camera, Localizer, Origin, Rig
 from kcal.locate import enu_from_cam
 from kcal.locate.views import shared_pixels
-from kcal.pipeline.measurements import ALONE_M, known_views, view_rows
+from kcal.pipeline.measurements import ALONE_M, known_views, sightings
 
 
 def mixed_stations() -> Rig:
@@ -35,31 +35,35 @@ def test_rows_are_those_of_the_rig() -> None:
     covariance = (mix @ mix.T + torch.eye(6)).expand(3, 6, 6)
     posed, common = localize.posed, localize.common
     marks = torch.where(seen[..., None], pixels + torch.tensor([0.3, 0.0]), torch.nan)
-    found = view_rows(known_views(posed, common), marks, seen, covariance)
+    found = sightings(known_views(posed, common), marks, seen, covariance, torch.zeros(3, 3).double())
     assert found.anchor.tolist() == [0, 1, 2]
     assert found.alone.tolist() == [False, False, True]
-    assert bool(found.fitted.all())
+    assert bool(found.usable.all())
     torch.testing.assert_close(float(found.inverse[2]) * ALONE_M, 1.0)
     # Pixels at the place that rows are linear around, and where it moves.
     steps = torch.cat([torch.zeros(1, 3), torch.eye(3)]).double() * torch.tensor([1e-6, 1e-6, 1e-9])
-    first, second = found.sides
+    first, second, _ = found.by_ray
     around = [
         rig((found.place + (found.direction + a * first + b * second) / (found.inverse + c)).T)[0]
         for a, b, c in steps.tolist()
     ]
     there = seen[..., None]
-    off = torch.where(there, around[0] - marks, 0.0).flatten(1).T
-    torch.testing.assert_close(found.residual, off, rtol=0, atol=1e-6)
-    for axis in range(3):
-        slope = torch.where(there, (around[1 + axis] - around[0]) / steps[1 + axis, axis], 0.0).flatten(1).T
-        scale = float(slope.abs().max())
-        torch.testing.assert_close(found.jacobian[:, axis] / scale, slope / scale, rtol=0, atol=2e-3)
+    slopes = [
+        torch.where(there, (one - around[0]) / steps[axis, axis - 1], 0.0) for axis, one in enumerate(around[1:], 1)
+    ]
     assert common is not None
     at = found.place.T, found.direction.T, found.inverse
     shared = shared_pixels(posed, common, at, seen, torch.ones(()).double())
-    torch.testing.assert_close(found.shared[:, :-1], shared.transpose(0, 1), rtol=1e-9, atol=1e-12)
-    # Rows of what nobody saw are those of unit noise.
+    off = torch.where(there, marks - around[0], 0.0).flatten(1)
+    changes = [off, *(slope.flatten(1) for slope in slopes), *(-shared).movedim(-1, 1)]
+    # Rows have unit noise: their products are those of pixels, weighed by the inverse covariance of what was seen.
     both = seen.repeat_interleave(2, -1)
     whole = torch.where(both[:, :, None] & both[:, None], covariance, torch.eye(6).double())
-    white = found.white.movedim(-1, 0)
-    torch.testing.assert_close(white @ whole @ white.mT, torch.eye(6).double().expand(3, 6, 6))
+    rows = [found.value, *found.late.sum(0).unbind(1), *found.shared.unbind(1)]
+    wanted = torch.stack(changes, -1)
+    wanted = wanted.mT @ torch.linalg.solve(whole, wanted)
+    given = torch.stack(rows, -1).movedim(1, 0)
+    scale = wanted.diagonal(dim1=-2, dim2=-1).sqrt().clamp_min(1e-3)
+    scale = scale[:, :, None] * scale[:, None]
+    torch.testing.assert_close(given.mT @ given / scale, wanted / scale, rtol=0, atol=2e-3)
+    assert not bool(given[2, :4].any())
