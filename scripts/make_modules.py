@@ -32,7 +32,7 @@ from kcal.lens import CameraRays, StereoRectification, Undistort, UndistortImage
 from kcal.lens.baking import LookupCamera, bake
 from kcal.lens.camera_parameters import CameraDistortion, ExtendedDistortion
 from kcal.lens.views import Cylinder
-from kcal.locate import DisparityRanges, Triangulate, enu_from_cam
+from kcal.locate import DisparityRanges, enu_from_cam
 from kcal.nets import InverseNet, ResidualNet
 from kcal.rig import mounting_covariance
 from kcal.solve import LevenbergMarquardt
@@ -285,10 +285,6 @@ CASES: dict[str, Case] = {
     "Rig": Case(
         make=stations, inputs=lambda: {"points": 10.0 * PLACES + torch.tensor([0.0, 4000, 0], dtype=torch.float64)},
         batched=("points",),
-    ),
-    "Triangulate": Case(
-        make=lambda n: Triangulate(rig(n), 0.3 + 0.1 * n),
-        inputs=pairs, batched=("pixels", "other"), otherwise=lambda: Triangulate(rig(0), method="linear"),
     ),
     "Localizer": Case(
         make=stereo, inputs=lambda: {**pairs(), "cov": pair_cov()}, batched=("pixels", "other", "cov"),

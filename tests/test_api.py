@@ -52,7 +52,7 @@ PUBLIC = {
         scene_features skyline_attitude skyline_source stated_mounting station_rig
     """,
     "kcal.locate": """
-        BudgetErrors DisparityRanges Marks Site Triangulate area_of check_ranges enu_from_cam enu_to_geodetic find_geoid
+        BudgetErrors DisparityRanges Marks Site area_of check_ranges enu_from_cam enu_to_geodetic find_geoid
         geodetic_to_enu level_ground range_errors rank_sites read_marks terrain
         write_positions
     """,

@@ -15,7 +15,6 @@ from kcal import Camera, Localizer, Origin, Rig
 from kcal.lens import LensModel, Unproject
 from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
-from kcal.locate import Triangulate
 from kcal.nets import NetworkModes
 from kcal.rig import RigCovariance
 
@@ -112,8 +111,8 @@ def test_an_earlier_call_runs_once_more() -> None:
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
 
 
-def test_triangulation_of_rays_through_a_network() -> None:
-    module = Triangulate(stereo(NetworkModes.random(6)))
+def test_positions_of_rays_through_a_network() -> None:
+    module = Localizer(stereo(NetworkModes.random(6)))
     assert_equal(compiled(module)[0](*marks(module.rig)), module(*marks(module.rig)))
     one = module.rig.left
     for other, points in ((one, torch.rand(4, 3).double() + 0.5), (Unproject(one), 900.0 * torch.rand(4, 2).double())):

@@ -17,7 +17,6 @@ import kcal
 from kcal import Board, Camera, Localizer, Observations, Origin, Rig, View
 from kcal.corners.detect import Detection
 from kcal.lens import rotation_from_vector
-from kcal.locate import Triangulate
 from kcal.rig import RigCovariance
 
 ROOT = Path(__file__).parents[1]
@@ -70,7 +69,6 @@ def test_results() -> None:
     left = torch.full((7, 2), 500.0)
     right = left - torch.tensor([3.2, 0.0])
     right[5:] += 10.0
-    check(Triangulate(RIG)(left, right), "Triangulation(5 OK, 2 PARALLEL, points=(7, 3)")
     localize = Localizer(RIG.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0))
     check(localize(left, right), "Localization(5 OK, 2 PARALLEL, enu=(7, 3)")
     located = located_pairs(RIG, left[:1], right[:1], origin=Origin(lat=1.0, lon=2.0, height=3.0), heading_deg=0.0)
@@ -172,7 +170,7 @@ def test_every_other_public_class_is_told_in_three_lines() -> None:
         Observations(board=board, image_size=(9, 9), views=()),
         kcal.lens.CameraRays(CAMERA), kcal.lens.ExtendedDistortion(CAMERA.coefficients, "opencv5"),
         kcal.lens.StereoRectification(RIG), kcal.lens.Undistort(CAMERA), kcal.lens.UndistortImage(CAMERA),
-        kcal.lens.Unproject(CAMERA), kcal.corners.RefineCorners(), Triangulate(RIG),
+        kcal.lens.Unproject(CAMERA), kcal.corners.RefineCorners(),
         kcal.locate.DisparityRanges(kcal.lens.StereoRectification(RIG)), kcal.track.ObjectDisparity(RIG),
         kcal.track.PairBoxes(RIG), kcal.track.Tracker(localize), kcal.rig.Watched(RIG), kcal.nets.InverseNet(CAMERA),
         kcal.nets.ResidualNet(CAMERA),

@@ -18,7 +18,7 @@ from kcal import Board, Camera, InputError, KcalWarning, Localizer, Observations
 from kcal.corners import refine_point
 from kcal.doors import _is_kind, _naming_slips
 from kcal.lens import camera_difference, pixel_covariance, rotation_from_vector, vector_from_rotation
-from kcal.locate import Marks, Triangulate, enu_to_geodetic
+from kcal.locate import Marks, enu_to_geodetic
 
 CAMERA = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
 BOARD = Board(columns=3, rows=3, square=0.1)
@@ -161,13 +161,10 @@ DOORS: dict[str, tuple[Callable[[Any], Any], int]] = {
     "rig": (RIG, 3),
     "right_from_left": (RIG.right_from_left, 3),
     "stations": (STATIONS, 3),
-    "triangulate left": (lambda bad: Triangulate(RIG)(bad, PIXELS), 2),
-    "triangulate right": (lambda bad: Triangulate(RIG)(PIXELS, bad), 2),
     "localize": (lambda bad: LOCALIZE(bad, PIXELS), 2),
     "localize cov": (lambda bad: LOCALIZE(PIXELS, PIXELS, bad), 4),
     "sensitivity": (lambda bad: LOCALIZE.sensitivity(PIXELS, bad), 2),
     "marks": (lambda bad: Marks.of_pair(("a",) * 4, PIXELS, bad), 2),
-    "views": (Triangulate(STATIONS), 2),
     "multi": (Localizer(STATIONS), 2),
     "geodetic": (lambda bad: enu_to_geodetic(bad, LOCALIZE.origin), 3),
     "camera": (lambda bad: Camera(bad, size=(640, 480)), 10),

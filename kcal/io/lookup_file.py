@@ -148,8 +148,8 @@ def _two(arrays: dict[str, np.ndarray], key: str, kinds: str, low: float, high: 
 def save_onnx(module: nn.Module, example: Tensor | Sequence[Tensor], path: str | Path) -> Path:
     """Write a module that maps points (N, K) as ONNX, for any number of points from two up.
 
-    `Camera` itself is such a module (`project`); `Unproject`, `LookupCamera`, `Triangulate` and `Localizer`
-    (without a covariance) are others. The graph is written as it was traced, and its numbers in float64: the optimizer
+    `Camera` itself is such a module (`project`); `Unproject`, `LookupCamera` and `Localizer` (without a
+    covariance) are others. The graph is written as it was traced, and its numbers in float64: the optimizer
     of onnxscript 0.7, on by default in `torch.onnx.export`, takes constants within 1e-5 of one for one and below 1e-8
     for zero, and so drops the cosine of a small tilt or a small coefficient without a word. Runtimes optimize on their
     own when they load the graph.

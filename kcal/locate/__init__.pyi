@@ -6,9 +6,8 @@ from kcal.locate.marks import read_marks as read_marks
 from kcal.locate.marks import Marks as Marks
 from kcal.locate.export import write_positions as write_positions
 
-# Triangulate
-from kcal.locate.triangulate import Triangulate as Triangulate
-from kcal.locate.triangulate import DisparityRanges as DisparityRanges
+# Ranges from disparities
+from kcal.locate.disparity import DisparityRanges as DisparityRanges
 
 # Points on the ground
 from kcal.locate.ground import level_ground as level_ground

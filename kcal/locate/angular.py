@@ -31,7 +31,7 @@ HORIZON = 1e12
 _SAME_SIDE = 0.1
 
 
-Method = Literal["linear", "angular", "likelihood"]
+Method = Literal["linear", "angular"]
 
 
 class Found(NamedTuple):
@@ -350,7 +350,7 @@ def triangulate(
         rays: (..., N, C, 3) directions in each camera's frame, any length but zero.
         seen: (..., N, C) bool: which cameras saw what, two at least; what is False is not read. All, if left out.
         method: "angular" or "linear": see `triangulate_angular` and `triangulate_linear`. What is most likely depends
-            on the noise of pixels, not of rays: see `Triangulate`.
+            on the noise of pixels, not of rays: see `kcal.Localizer`.
 
     Raises:
         InputError: wrong shapes or dtypes, another method.

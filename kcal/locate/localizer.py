@@ -41,6 +41,7 @@ from kcal.locate.stereo import (
 from kcal.locate.views import (
     CommonErrors,
     PosedCameras,
+    Reach,
     ViewsFit,
     errors_by_camera,
     fit_pairs,
@@ -408,7 +409,7 @@ class Localizer(Operations, Movable, StatedModule):
 
     def _by_marks(self, found: ViewsFit) -> Localization:
         """Positions of pairs and all their errors."""
-        fit, scale, usable = found.fit, found.scale, found.fitted
+        fit, scale = found.fit, found.scale
         spread = [found.variance * entry for entry in fit.covariance]
         if self.calibration_factor is not None:
             factors = [self.calibration_factor, *([] if self.link is None else [self.link])]
@@ -416,13 +417,11 @@ class Localizer(Operations, Movable, StatedModule):
             moved, by_link = effect.tensor_split([self.calibration_factor.shape[1]], -2)
             for number, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
                 spread[number] = spread[number] + (moved[..., i, :, :] * moved[..., j, :, :]).sum(-2)
-        reach = reach_of(found, inverse_variance(fit, spread), PositionStatus.BEARING_ONLY)
+        reach = reach_of(found, inverse_variance(fit, spread))
         ok = reach.status == int(PositionStatus.OK)
-        there = usable | (reach.status == int(PositionStatus.PARALLEL))
         look = self.enu_from_rig
         bearing = (fit.direction / found.length[..., None, :]).mT @ look.mT
-        depth = scale / torch.where(ok, fit.inverse, 1.0)
-        enu = torch.where(ok[..., None], depth[..., None] * (fit.direction.mT @ look.mT), 0.0)
+        enu = found.points(ok) @ look.mT
         slope = look @ position_slope(fit, scale, ok)
         covariance = slope @ symmetric(spread) @ slope.mT
         up = torch.stack([*torch.zeros_like(enu[..., :2]).unbind(-1), enu[..., :2].square().sum(-1)], -1)
@@ -434,22 +433,25 @@ class Localizer(Operations, Movable, StatedModule):
                 mixed = slope @ by_link.movedim(-1, -3) @ turn.mT
                 covariance = covariance + mixed + mixed.mT
         covariance = torch.where(ok[..., None, None], covariance, torch.diag(covariance.new_full((3,), math.inf)))
-        step = self.freed_step
+        there = found.fitted | (reach.status == int(PositionStatus.PARALLEL))
+        bearing = torch.where(there[..., None], bearing, 0.0)
+        return self._told(found, reach, (enu, covariance, bearing, found.pair_misfit))
+
+    def _told(self, found: ViewsFit, reach: Reach, positions: tuple[Tensor, Tensor, Tensor, Tensor]) -> Localization:
+        """All of it, with positions, covariances, bearings and misfits."""
+        enu, covariance, bearing, misfit = positions
+        step, ok = self.freed_step, reach.status == int(PositionStatus.OK)
         return Localization(
             enu=enu,
             covariance=covariance,
             geodetic=self._geodetic(enu if step is None else enu + step[0], ok),
-            range_low=reach.interval.low,
-            range_high=reach.interval.high,
-            status=reach.status,
-            bearing=torch.where(there[..., None], bearing, 0.0),
-            inverse_range=reach.value,
-            inverse_range_sigma=reach.sigma,
-            reprojection=reprojection_errors(fit.residual),
-            anchor=torch.zeros_like(reach.status, dtype=torch.int64),
+            bearing=bearing,
+            reprojection=reprojection_errors(found.fit.residual),
+            anchor=found.anchor.to(torch.int64).argmax(-1),
             used=found.used,
             bad=torch.zeros_like(found.used),
-            misfit=found.pair_misfit,
+            misfit=misfit,
+            **reach._asdict(),
         )
 
     def _geodetic(self, enu: Tensor, ok: Tensor) -> Tensor:
@@ -512,28 +514,13 @@ class Localizer(Operations, Movable, StatedModule):
 
     def _by_all(self, posed: PosedCameras, views: ViewsFit, falls: Tensor) -> Localization:
         fit, variance = views.fit, views.variance * inverse_variance(views.fit, views.fit.covariance)
-        reach = reach_of(views, variance, PositionStatus.BEARING_ONLY, views.behind(posed.center))
+        reach = reach_of(views, variance, views.behind(posed.center))
         ok = reach.status == int(PositionStatus.OK)
-        enu = torch.where(ok[..., None], views.points(ok), 0.0)
-        aimed = views.used.any(-1)
         own = (fit.direction / views.length[..., None, :]).mT
         sight = torch.where(views.fitted[..., None], own, (views.anchor[..., None] * views.rays).sum(-2))
-        return Localization(
-            enu=enu,
-            covariance=views.covariance(ok),
-            geodetic=self._geodetic(enu, ok),
-            status=reach.status,
-            anchor=views.anchor.to(torch.int64).argmax(-1),
-            bearing=torch.where(aimed[..., None], sight, 0.0),
-            inverse_range=reach.value,
-            inverse_range_sigma=reach.sigma,
-            range_low=reach.interval.low,
-            range_high=reach.interval.high,
-            used=views.used,
-            bad=torch.zeros_like(views.used),
-            misfit=(0.5 * falls.clamp_min(0.0)).sqrt(),
-            reprojection=torch.where((views.used & views.fitted[..., None]), reprojection_errors(fit.residual), 0.0),
-        )
+        bearing = torch.where(views.used.any(-1)[..., None], sight, 0.0)
+        enu = torch.where(ok[..., None], views.points(ok), 0.0)
+        return self._told(views, reach, (enu, views.covariance(ok), bearing, (0.5 * falls.clamp_min(0.0)).sqrt()))
 
     def _contradicting(self, found: Localization, torn: Tensor) -> Localization:
         """The same, without a position where `torn` (N,)."""

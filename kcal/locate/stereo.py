@@ -32,19 +32,7 @@ QUANTILE = 1.959963984540054
 BEARING_SIGMAS = 3.0
 
 
-class RangeInterval(NamedTuple):
-    """Ends of the 95 % interval in meters from the left camera, (..., N) each.
-
-    Attributes:
-        low: nearest range; infinite if the rays diverge by more than the noise explains.
-        high: farthest range; infinite if the point may be at infinity.
-    """
-
-    low: Tensor
-    high: Tensor
-
-
-def range_interval(inverse_range: Tensor, sigma: Tensor, known: Tensor | None = None) -> RangeInterval:
+def range_interval(inverse_range: Tensor, sigma: Tensor, known: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The 95 % interval of the range, from the interval inverse_range ± 1.96 sigma.
 
     Args:
@@ -64,7 +52,7 @@ def range_interval(inverse_range: Tensor, sigma: Tensor, known: Tensor | None = 
         ahead = inverse > 0
         reach = torch.where(ahead, 1.0 / torch.where(ahead, inverse, 1.0), math.inf)
         ends.append(reach if known is None else torch.where(known, reach, unknown))
-    return RangeInterval(*ends)
+    return ends[0], ends[1]
 
 
 # Radians. A smaller parallax is parallel for any camera: the point would be a billion baselines away.
@@ -270,12 +258,6 @@ def _epipolar(left: Tensor, right: Tensor, baseline: Tensor) -> tuple[Tensor, Te
     return parallel | ~in_plane, across <= 0, ~in_plane
 
 
-def range_where_ok(status: Tensor, inverse_range: Tensor) -> Tensor:
-    """(..., N) one over `inverse_range`; infinite unless the status is OK."""
-    ok = status == int(PositionStatus.OK)
-    return torch.where(ok, 1.0 / torch.where(ok, inverse_range, 1.0), torch.inf)
-
-
 def reprojection_errors(residual: Tensor) -> Tensor:
     """Residuals (..., 2 C, N) to distances in px (..., N, C), with a gradient of zero where there is no error."""
     squared = residual.unflatten(-2, (-1, 2)).square().sum(-2)
@@ -334,7 +316,8 @@ class Localization(NamedTuple):
     @property
     def range(self) -> Tensor:
         """(..., N) meters from the camera `anchor`; infinite unless the status is OK."""
-        return range_where_ok(self.status, self.inverse_range)
+        ok = self.status == int(PositionStatus.OK)
+        return torch.where(ok, 1.0 / torch.where(ok, self.inverse_range, 1.0), torch.inf)
 
 
 @briefly

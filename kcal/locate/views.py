@@ -25,7 +25,6 @@ from kcal.locate.max_likelihood import (
 from kcal.locate.stereo import (
     BEARING_SIGMAS,
     PositionStatus,
-    RangeInterval,
     flag_positions,
     joint_covariance,
     range_interval,
@@ -35,10 +34,10 @@ from kcal.texts import briefly
 
 # Pixels of any subset of cameras to points with errors, each point on its own.
 #
-# `Triangulate` and the localizers share what is here. A point is sought from the first camera that saw it,
-# its anchor, as a direction and an inverse distance in the frame of all cameras. Errors that a camera's marks share
-# (lens, center, attitude, refraction) are to first order correlated noise of the pixels: a point is weighed by the
-# inverse covariance of all of them together, so that a camera whose attitude is poor counts less.
+# A point is sought from the first camera that saw it, its anchor, as a direction and an inverse distance in the frame
+# of all cameras. Errors that a camera's marks share (lens, center, attitude, refraction) are to first order correlated
+# noise of the pixels: a point is weighed by the inverse covariance of all of them together, so that a camera whose
+# attitude is poor counts less.
 
 # Share of a view's information that the others must be able to check: below, leaving it out tells nothing.
 _UNCHECKED = 1e-9
@@ -447,27 +446,20 @@ def fit_pairs(
 
 
 class Reach(NamedTuple):
-    """One over the range, whose errors are Gaussian at any distance, and what follows from it; each (..., N).
+    """One over the range, whose errors are Gaussian at any distance, and what follows from it: see `Localization`."""
 
-    Attributes:
-        value: one over meters from the anchor; zero unless there is an optimum.
-        sigma: its standard deviation; zero where nothing is known.
-        interval: the 95 % interval of the range, meters.
-        weak: where the parallax is below three of its sigmas.
-        status: int8: PARALLEL where the value is not positive.
-    """
-
-    value: Tensor
-    sigma: Tensor
-    interval: RangeInterval
-    weak: Tensor
+    inverse_range: Tensor
+    inverse_range_sigma: Tensor
+    range_low: Tensor
+    range_high: Tensor
     status: Tensor
 
 
-def reach_of(found: ViewsFit, variance: Tensor, weak_status: PositionStatus, behind: Tensor | None = None) -> Reach:
+def reach_of(found: ViewsFit, variance: Tensor, behind: Tensor | None = None) -> Reach:
     """Range and status of fitted points, given the variance (..., N) of `fit.inverse`.
 
-    What is `OK` and weak gets `weak_status`; what is `behind` (..., N) a camera that saw it, BEHIND.
+    `BEARING_ONLY` where the parallax is below three of its sigmas, PARALLEL where the inverse range is not positive,
+    BEHIND what is `behind` (..., N) a camera that saw it.
     """
     fit, usable, code, unit = found.fit, found.fitted, found.status, found.scale * found.length
     value = torch.where(usable, fit.inverse / unit, 0.0)
@@ -478,15 +470,14 @@ def reach_of(found: ViewsFit, variance: Tensor, weak_status: PositionStatus, beh
     with torch.no_grad():
         weak = usable & (~known | (value < BEARING_SIGMAS * sigma))
         lost = usable & ~(value > 0)
-        code = flag_positions(code, weak & (code == int(PositionStatus.OK)), weak_status)
+        code = flag_positions(code, weak & (code == int(PositionStatus.OK)), PositionStatus.BEARING_ONLY)
         if behind is not None:
             code = flag_positions(code, behind, PositionStatus.BEHIND)
         code = flag_positions(code, lost, PositionStatus.PARALLEL)
         # What the closed form put at infinity may have come back in front of the rig.
         back = usable & ~lost & ~weak
         code = flag_positions(code, back if behind is None else back & ~behind, PositionStatus.OK)
-    interval = RangeInterval(*map(found.steady, range_interval(value, sigma, known)))
-    return Reach(value, sigma, interval, weak, code)
+    return Reach(value, sigma, *map(found.steady, range_interval(value, sigma, known)), code)
 
 
 def errors_by_camera(rig: Rig) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:

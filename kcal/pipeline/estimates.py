@@ -109,7 +109,7 @@ def track_states(
     status = flag_positions(status, inverse_range < BEARING_SIGMAS * sigma, PositionStatus.BEARING_ONLY)
     status = flag_positions(status, inverse_range <= 0, PositionStatus.PARALLEL)
     ok = status == int(PositionStatus.OK)
-    interval = range_interval(inverse_range, sigma)
+    low, high = range_interval(inverse_range, sigma)
 
     depth = 1.0 / torch.where(ok, mean[2], 1.0)
     bearing = (axes * ray).sum(1)
@@ -133,8 +133,8 @@ def track_states(
         velocity=torch.where(ok[:, None], velocity.T, 0.0),
         velocity_covariance=torch.where(there, whole[:, 3:, 3:], nowhere),
         geodetic=torch.where(ok[:, None], geodetic, localize.geodetic_of_origin),
-        range_low=interval.low,
-        range_high=interval.high,
+        range_low=low,
+        range_high=high,
         status=status,
         bearing=(bearing / length).T,
         inverse_range=inverse_range,

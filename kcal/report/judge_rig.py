@@ -21,8 +21,7 @@ from kcal.lens.pose import step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
 from kcal.lens.rig import Rig
 from kcal.locate.budget import RangeSigmas, range_sigmas, station_sigmas
-from kcal.locate.stereo import PositionStatus
-from kcal.locate.triangulate import Triangulate
+from kcal.locate.views import fit_pairs
 from kcal.report.judge_camera import stored_findings
 from kcal.report.verdict import RangeAnswer, Requirement, Verdict, weighed_findings
 from kcal.solve.lm import LMOptions
@@ -427,8 +426,9 @@ def triangulated_sides(rig: Rig, columns: int, rows: int, pixels: Tensor, points
     known = None if points is None else as_points("points", points, 3)
     if known is not None and known.shape != (columns * rows, 3):
         raise InputError(f"points: shape ({columns * rows}, 3) is needed, got {tuple(known.shape)}")
-    located = Triangulate(rig)(pixels[:, 0], pixels[:, 1])
-    points = torch.where((located.status == PositionStatus.OK)[..., None], located.points, torch.nan)
+    found = fit_pairs(rig, pixels[:, 0], pixels[:, 1])
+    ahead = found.fitted & (found.fit.inverse > 0)
+    points = torch.where(ahead[..., None], found.points(ahead), torch.nan)
     sides = _grid_sides(points, columns, rows)
     if known is not None:
         ordered = _grid_sides(known[None], columns, rows)

@@ -18,7 +18,6 @@ from kornia.geometry.epipolar import triangulate_points
 from torch import Tensor
 
 from kcal import Camera, Localizer, Origin, Rig, load_rig
-from kcal.locate import Triangulate
 from kcal.pipeline.association import associate
 from kcal.rig import RigCovariance, planned_rig
 from kcal.track import Detections, ObjectDisparity
@@ -134,7 +133,7 @@ def gradients(lenses: tuple[str, ...] = tuple(LENSES)) -> Iterator[str]:
             lambda: backward(lambda x: undistort_points(x, K, d, num_iters=20), pixels),
         ],
         "triangulate, pinhole": [
-            lambda: backward(lambda x, y: Triangulate(rig)(x, y).points, a, b),
+            lambda: backward(lambda x, y: Localizer(rig)(x, y).enu, a, b),
             lambda: backward(lambda x, y: triangulate_points(P[None], Q[None], x[None], y[None]), a, b),
         ],
     }

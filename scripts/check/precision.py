@@ -21,10 +21,10 @@ import torch
 from mpmath import mpf
 from torch import Tensor
 
-from kcal import Camera, InputError, Origin, PositionStatus, Rig, load_camera, load_rig, save_camera
+from kcal import Camera, InputError, Localizer, Origin, PositionStatus, Rig, load_camera, load_rig, save_camera
 from kcal.lens import bake, rotation_from_vector, save_onnx, undistort_maps
 from kcal.lens.views import new_pinhole
-from kcal.locate import Triangulate, enu_to_geodetic, geodetic_to_enu
+from kcal.locate import enu_to_geodetic, geodetic_to_enu
 from kcal.stars.sky import Air, StarCatalog, observed_directions
 from scripts.shared.page import table
 from scripts.shared.sections import section
@@ -38,7 +38,7 @@ LENSES = {
 }
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
 PIXELS_OF = {"float64": torch.float64, "float32": torch.float32}
-BASELINE, FOCAL, SIGMA = 10.0, 1600.0, 0.3
+BASELINE, FOCAL, SIGMA = 10.0, 1600.0, 0.05
 RANGES = (100.0, 1000.0, 5000.0, 50000.0)
 mpmath.mp.dps = 50
 
@@ -191,7 +191,7 @@ def pair_rows(count: int) -> list[list[str]]:
     turn = rotation_from_vector(torch.tensor([0.01, -0.02, 0.015], dtype=torch.float64))
     center = torch.tensor([BASELINE, 0.3, -0.2], dtype=torch.float64)
     rig = Rig.pair(left, right, turn, -turn @ center)
-    pair, rows = Triangulate(rig, pixel_sigma=SIGMA), []
+    pair, rows = Localizer(rig, pixel_sigma=SIGMA), []
     matrix, shift = [exactly(line) for line in turn], exactly(-turn @ center)
     lefts, rights = exactly(left.params.detach()), exactly(right.params.detach())
 
@@ -210,11 +210,11 @@ def pair_rows(count: int) -> list[list[str]]:
         for kind, dtype in PIXELS_OF.items():
             found = pair(pixels[:, :2].to(dtype), pixels[:, 2:].to(dtype))
             assert int(found.status.max()) == 0
-            off[kind] = float(((found.points - points).norm(dim=-1) / away).max())
+            off[kind] = float(((found.enu - points).norm(dim=-1) / away).max())
             if kind == "float64":
                 for point, sigma in list(zip(points, found.inverse_range_sigma.tolist(), strict=True))[:5]:
                     spread = max(spread, abs(float(mpf(sigma) / _sigma(exactly(point), seen) - 1)))
-        rows.append([f"`Triangulate` at {away:,.0f} m, baseline 10 m, relative", *shown(off)])
+        rows.append([f"`Localizer` at {away:,.0f} m, baseline 10 m, relative", *shown(off)])
         rows.append([f"its σ of the inverse range at {away:,.0f} m, relative to first order", f"{spread:.1e}", "–"])
     return rows
 
@@ -298,7 +298,7 @@ def limit_rows() -> list[list[str]]:
     """What is answered beyond the domain, asked now."""
     camera, folding = camera_of("opencv5"), lens_of([-0.9])
     wide = camera_of("fisheye4")
-    pair = Triangulate(Rig.pair(camera, camera, torch.eye(3), torch.tensor([-BASELINE, 0.0, 0.0])))
+    pair = Localizer(Rig.pair(camera, camera, torch.eye(3), torch.tensor([-BASELINE, 0.0, 0.0])))
     middle = torch.tensor([[962.0, 538.0]], dtype=torch.float64)
 
     def mask(answer: tuple[Tensor, Tensor]) -> str:
@@ -306,8 +306,7 @@ def limit_rows() -> list[list[str]]:
 
     def status(left: Tensor, right: Tensor) -> str:
         found = pair(left, right)
-        name = PositionStatus(int(found.status[0])).name
-        return f"{name}{', bearing only' if bool(found.bearing_only[0]) else ''}"
+        return PositionStatus(int(found.status[0])).name
 
     def refusal(dtype: torch.dtype) -> str:
         try:
@@ -325,10 +324,10 @@ def limit_rows() -> list[list[str]]:
         ["fisheye: `project` 100° off axis", mask(wide.project(torch.tensor([[1.0, 0.0, math.cos(1.7453)]])))],
         ["fisheye: `normalize` of a pixel beyond 89° off axis", mask(wide.normalize(torch.tensor([[3400.0, 538.0]])))],
         ["`project` of a point that is infinite or NaN", mask(camera.project(torch.tensor([[0.0, math.nan, 1.0]])))],
-        ["`Triangulate`, parallax below 3 σ", status(middle, middle - 0.5 * shift)],
-        ["`Triangulate`, parallel rays", status(middle, middle)],
-        ["`Triangulate`, diverging rays", status(middle, middle + 20 * shift)],
-        ["`Triangulate`, mark outside the image", status(middle * 3, middle)],
+        ["`Localizer`, parallax below 3 σ", status(middle, middle - 0.5 * shift)],
+        ["`Localizer`, parallel rays", status(middle, middle)],
+        ["`Localizer`, diverging rays", status(middle, middle + 20 * shift)],
+        ["`Localizer`, mark outside the image", status(middle * 3, middle)],
         *([f"pixels of {str(kind).removeprefix('torch.')}", refusal(kind)]
           for kind in (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64)),
     ]  # fmt: skip

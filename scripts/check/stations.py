@@ -29,8 +29,8 @@ import torch
 from torch import Tensor
 
 from kcal import Camera, Localizer, Rig
-from kcal.locate import Triangulate
 from kcal.locate.stereo import Localization, PositionStatus
+from kcal.locate.views import fit_views
 from scripts.shared.page import DOCS, table
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import section
@@ -82,7 +82,6 @@ def peers_of(rig: Rig) -> dict[str, tuple[Solve, int]]:
     """Functions from pixels (N, C, 2) to points (N, 3), and by how much fewer points they are timed on."""
     matrices, found = projections(rig), dict[str, tuple[Solve, int]]()
     shift = -(rig.rotation @ rig.center[..., None])
-    plain = Triangulate(rig, pixel_sigma=1.0)
     checked = Localizer(rig, pixel_sigma=1.0)
 
     def ours(pixels: np.ndarray) -> np.ndarray:
@@ -90,10 +89,12 @@ def peers_of(rig: Rig) -> dict[str, tuple[Solve, int]]:
         return np.where((result.status == OK).numpy()[:, None], result.enu.numpy(), np.nan)
 
     def views(pixels: np.ndarray) -> np.ndarray:
-        result = plain(torch.from_numpy(pixels))
-        return np.where((result.status == OK).numpy()[:, None], result.points.numpy(), np.nan)
+        marks = torch.from_numpy(pixels)
+        fit = fit_views(checked.posed, marks, torch.isfinite(marks).all(-1), noise=1.0)
+        ok = fit.fitted & (fit.fit.inverse > 0) & ~fit.behind(rig.center)
+        return np.where(ok.numpy()[:, None], fit.points(ok).numpy(), np.nan)
 
-    found["kcal `Localizer`"], found["kcal `Triangulate`"] = (ours, 1), (views, 1)
+    found["kcal `Localizer`"], found["kcal, no mark left out"] = (ours, 1), (views, 1)
     try:
         import cv2
         from aniposelib.cameras import Camera as OtherCamera  # type: ignore[import-not-found]
@@ -306,7 +307,8 @@ def real() -> list[str]:
     pixels, sure = keypoints[..., :2].reshape(-1, 4, 2), keypoints[..., 2].reshape(-1, 4)
     seen = (sure > 0.3) & torch.isfinite(pixels).all(-1)
     # The noise by which half of the joints that all four see have less than the median of χ² with 5 degrees.
-    free = Triangulate(rig, pixel_sigma=1.0)
+    # Wide, so that no mark is left out.
+    free = Localizer(rig, pixel_sigma=1e3)
     first = free(torch.where(seen[..., None], pixels, math.nan))
     four = (first.status == OK) & seen.all(-1)
     sigma = float((first.reprojection[four].square().sum(-1).median() / 4.351).sqrt())
@@ -323,7 +325,7 @@ def real() -> list[str]:
              f"{float(own.square().mean().sqrt()):.2f}", f"{float(held.median()):.2f}" if len(held) else ""]
         )  # fmt: skip
     heads = ["cameras", "joints located", "of them a view left out", "contradictions", "RMS px", "held out, median px"]
-    again, _ = rig(first.points[four])
+    again, _ = rig(first.enu[four])
     off = (pixels[four] - again).mean(0).norm(dim=-1).tolist()
     note = f"{len(pixels)} joints; noise of a mark along an axis {sigma:.2f} px, from the joints that all four see; "
     offsets = ", ".join(f"{name} {one:.1f}" for name, one in zip(rig.names, off, strict=True))

@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Camera, KcalError, Landmarks, RigData, RigOptions, solve_rig
-from kcal.locate import Triangulate
+from kcal import Camera, KcalError, Landmarks, Localizer, RigData, RigOptions, solve_rig
 from kcal.sim.scene import DemoScene
 from scripts.paper.site import MARK_SIGMA, SURVEY_SIGMA, PaperScene
 from scripts.shared.long_range import range_sigma
@@ -123,7 +122,7 @@ def bound(scene: DemoScene) -> list[float]:
 
 
 def by_kcal(scene: DemoScene, cameras: tuple[Camera, Camera]) -> Orient:
-    """`solve_rig` on the landmarks, and `Triangulate`."""
+    """`solve_rig` on the landmarks, and `Localizer`."""
 
     def orient(points: Tensor, left: Tensor, right: Tensor) -> Rig:
         landmarks = Landmarks(
@@ -141,12 +140,14 @@ def by_kcal(scene: DemoScene, cameras: tuple[Camera, Camera]) -> Orient:
         except (KcalError, RuntimeError):
             return lost
         rig = solved.stereo()
-        locate = Triangulate(rig, pixel_sigma=MARK_SIGMA)
+        locate = Localizer(rig, pixel_sigma=MARK_SIGMA)
 
         def place(left: Tensor, right: Tensor) -> Tensor:
             found = locate(left, right)
-            enu = found.points @ solved.rotation[0] + solved.center[0]
-            return torch.where((found.status == 0)[..., None], enu, torch.nan)
+            # Also where the parallax is below three sigma.
+            known = (found.inverse_range > 0)[..., None]
+            points = found.bearing / torch.where(known, found.inverse_range[..., None], 1.0)
+            return torch.where(known, points @ solved.rotation[0] + solved.center[0], torch.nan)
 
         def project(enu: Tensor) -> tuple[Tensor, Tensor]:
             # By the lenses, not the rig: a pixel outside the image is one too.

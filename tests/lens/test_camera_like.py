@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from kcal import Camera, InputError, Localizer, Origin, Rig, save_rig
 from kcal.lens import CameraLike, Undistort, bake, undistort_maps
-from kcal.locate import Triangulate
 
 MODEL = Camera.build(focal=(900, 900), center=(322, 238), size=(640, 480), coefficients=[-0.1, 0.02, 1e-3, -5e-4, 0.0])
 
@@ -76,8 +75,8 @@ def test_positions_are_those_of_the_camera_that_it_stands_for(kind: str) -> None
 def test_gradients_reach_the_weights_of_a_users_camera() -> None:
     mine = Mine()
     pixels = [part.detach() for part in rig(PLAIN, PLAIN)(POINTS)[0].unbind(-2)]
-    triangulate = Triangulate(rig(mine, mine))
-    (gradient,) = torch.autograd.grad(triangulate(*pixels).points[..., 2].sum(), mine.focal_length)
+    localize = Localizer(rig(mine, mine))
+    (gradient,) = torch.autograd.grad(localize(*pixels).enu[..., 2].sum(), mine.focal_length)
     # The depth is the focal length times the baseline over the disparity.
     assert float(gradient) == pytest.approx(float(POINTS[:, 2].sum()) / 900.0, rel=1e-6)
 

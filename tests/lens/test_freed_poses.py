@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from kcal import Camera, InputError, Localizer, Origin, Rig, load_rig, save_rig
 from kcal.lens import rotation_from_vector
-from kcal.locate import Triangulate
 from kcal.rig import Mounting
 from scripts.make_modules import PLACES, pairs, rig, stations, stereo
 
@@ -77,11 +76,11 @@ def test_what_has_a_graph_keeps_it() -> None:
     shift = nn.Parameter(start.right_from_left_translation.clone())
     own = Rig.pair(start.left, start.right, start.right_from_left_rotation, shift)
     assert dict(own.named_parameters())["translation"] is shift
-    found = Triangulate(own)(*pairs().values())
-    (by_shift,) = torch.autograd.grad(found.points.sum(), shift)
+    found = Localizer(own)(*pairs().values())
+    (by_shift,) = torch.autograd.grad(found.enu.sum(), shift)
     vector = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
     made = Rig.pair(start.left, start.right, rotation_from_vector(vector)[0], start.right_from_left_translation)
-    (by_turn,) = torch.autograd.grad(Triangulate(made)(*pairs().values()).inverse_range.sum(), vector)
+    (by_turn,) = torch.autograd.grad(Localizer(made)(*pairs().values()).inverse_range.sum(), vector)
     assert bool((by_shift != 0).all() and (by_turn != 0).all())
 
 
@@ -122,7 +121,7 @@ def test_ranges_and_covariance_without_the_earth() -> None:
     own = Rig.pair(one, one, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
     left = torch.tensor([[960.0, 540.0], [960.0, 540.0], [float("nan"), 0.0]], dtype=torch.float64)
     right = left - torch.tensor([[16.0, 0.0], [-1.0, 0.0], [0.0, 0.0]], dtype=torch.float64)
-    found = Triangulate(own, 0.1)(left, right)
+    found = Localizer(own, pixel_sigma=0.1)(left, right)
     assert found.range.tolist() == pytest.approx([1000.0, float("inf"), float("inf")])
     # Z = f b / d: its sigma is Z² / (f b) times that of a disparity, √2 of a mark's.
     assert float(found.covariance[0, 2, 2].sqrt()) == pytest.approx(1000.0**2 / 16000 * 0.1 * 2**0.5, rel=1e-3)

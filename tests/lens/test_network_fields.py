@@ -17,7 +17,6 @@ from kcal import Camera, InputError, Localizer, Origin, Rig, load_camera, save_c
 from kcal.io.rig_file import RigFile, load_rig, save_rig
 from kcal.lens import CameraRays, LensModel, Undistort, bake
 from kcal.lens.model import HybridForm
-from kcal.locate import Triangulate
 from kcal.nets import NetworkModes
 
 
@@ -163,18 +162,18 @@ def test_a_users_own_loop_trains_it_through_rays() -> None:
 
 
 def test_positions_carry_gradients_to_the_weights() -> None:
-    """Of triangulation and of the localizer, against differences."""
+    """In the rig's own frame and on the Earth, against differences."""
     rig = Rig.pair(camera("waves"), camera("waves"), torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
     rig.left.free("field")
     pixels = rig(torch.tensor([[3.0, 2.0, 300.0], [20.0, -8.0, 150.0]], dtype=torch.float64))[0].unbind(-2)
     assert rig.left.field is not None
     weight = rig.left.get_parameter("field.gate")
     origin = Origin(lat=50.0, lon=8.0, height=100.0)
-    for module in (Triangulate(rig), Localizer(rig.placed(origin=origin, heading_deg=0.0), pixel_sigma=0.2)):
+    for module in (Localizer(rig), Localizer(rig.placed(origin=origin, heading_deg=0.0), pixel_sigma=0.2)):
 
         def place(module: nn.Module = module) -> Tensor:
             found = module(pixels[0].detach(), pixels[1].detach())
-            value: Tensor = (found.points if hasattr(found, "points") else found.enu).norm(dim=-1).sum()
+            value: Tensor = found.enu.norm(dim=-1).sum()
             return value
 
         weight.grad = None

@@ -10,7 +10,7 @@ from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, standing, te
 from kcal import Camera, DegenerateError, InputError, Origin, PositionStatus, Rig
 from kcal.lens import rotation_from_vector
 from kcal.lens.projection import project_components
-from kcal.locate import Triangulate, enu_from_cam, enu_to_geodetic
+from kcal.locate import enu_from_cam, enu_to_geodetic
 from kcal.locate.localizer import Localization, Localizer
 from kcal.rig import RigCovariance, mounting_covariance
 
@@ -304,15 +304,6 @@ def test_batches_pieces_and_precision() -> None:
         got = halved(left[:9].float(), right[:9].float())
     for own, other in zip(got, module(left[:9].float().double(), right[:9].float().double()), strict=True):
         assert torch.equal(own, other)
-
-
-def test_agrees_with_triangulate() -> None:
-    left, right = RIG(spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64)))[0].unbind(-2)
-    ours, theirs = localizer(pixel_sigma=0.1)(left, right), Triangulate(RIG, 0.1)(left, right)
-    assert torch.equal(ours.range_high, theirs.range_high)
-    assert torch.equal(ours.range_low, theirs.range_low)
-    assert torch.equal(ours.inverse_range_sigma, theirs.inverse_range_sigma)
-    assert torch.allclose(ours.enu.norm(dim=-1), theirs.points.norm(dim=-1), rtol=1e-12)
 
 
 def test_sensitivities() -> None:

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from lenses import hybrid_camera
 from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, tensor, turned
 
-from kcal import Camera, DegenerateError, InputError, PositionStatus, Rig
-from kcal.locate import Triangulate
+from kcal import Camera, DegenerateError, InputError, Localizer, PositionStatus, Rig
 from kcal.locate.views import fit_pairs
 
 RIG = real_rig()
@@ -21,12 +20,12 @@ def test_exact_marks_give_the_point_back_through_real_lenses() -> None:
     pixels, seen = RIG(points)
     (left, right), seen = pixels.unbind(-2), seen.all(-1)
     assert seen.all()
-    result = Triangulate(RIG)(left, right)
+    result = Localizer(RIG, pixel_sigma=0.01)(left, right)
     near = points[:, 2] < 1000
     assert (result.status == PositionStatus.OK).all()
     # Pixels near 1000 hold 1e-13; at range Z that is Z² / (f b) * 1e-13 m.
-    assert (result.points - points)[near].norm(dim=-1).max() < 1e-9
-    assert ((result.points - points).norm(dim=-1) / points.norm(dim=-1)).max() < 1e-10
+    assert (result.enu - points)[near].norm(dim=-1).max() < 1e-9
+    assert ((result.enu - points).norm(dim=-1) / points.norm(dim=-1)).max() < 1e-10
     assert result.reprojection.max() < 1e-10
 
 
@@ -38,9 +37,9 @@ def test_pupils_move_by_meters_at_any_range() -> None:
     points = spread_points(torch.logspace(0.8, 5, 60, dtype=torch.float64))
     pixels, seen = rig(points)
     (seen_left, seen_right), seen = pixels.unbind(-2), seen.all(-1)
-    result = Triangulate(rig)(seen_left[seen], seen_right[seen])
+    result = Localizer(rig, pixel_sigma=1e-3)(seen_left[seen], seen_right[seen])
     assert int(seen.sum()) > 40
-    torch.testing.assert_close(1 / result.points.norm(dim=-1), 1 / points[seen].norm(dim=-1), rtol=0, atol=1e-13)
+    torch.testing.assert_close(1 / result.enu.norm(dim=-1), 1 / points[seen].norm(dim=-1), rtol=0, atol=1e-13)
 
 
 @settings(max_examples=25, deadline=None)
@@ -64,12 +63,12 @@ def test_round_trip_for_any_rig(
     point = depth * tensor([x, y, 1.0])
     pixels, seen = rig(point)
     (left, right), seen = pixels.unbind(-2), seen.all(-1)
-    result = Triangulate(rig)(left, right)
+    result = Localizer(rig, pixel_sigma=1e-3)(left, right)
     if bool(seen[0]) and bool(rig.left.inside(left)[0] & rig.right.inside(right)[0]):
         assert result.status.item() == PositionStatus.OK
         # Parallax 1e-4 rad at the worst, pixels rounded to 1e-13.
-        assert torch.allclose(result.points, point, rtol=1e-8)
-        assert result.range_low < result.points.norm() < result.range_high
+        assert torch.allclose(result.enu, point, rtol=1e-8)
+        assert result.range_low < result.enu.norm() < result.range_high
     else:
         assert result.status.item() != PositionStatus.OK
 
@@ -80,7 +79,7 @@ def test_range_slope_is_z_squared_over_focal_times_baseline() -> None:
     left, right = rig(tensor([0.0, 0.0, z]))[0].unbind(-2)
     left.requires_grad_()
     right.requires_grad_()
-    Triangulate(rig)(left, right).points[0, 2].backward()
+    Localizer(rig)(left, right).enu[0, 2].backward()
     slope = z * z / (focal * baseline)
     # More u on the left is more disparity: nearer. v carries no range.
     assert left.grad[0, 0].item() == pytest.approx(-slope, rel=1e-9)
@@ -92,12 +91,12 @@ def test_range_slope_is_z_squared_over_focal_times_baseline() -> None:
 def test_gradients_through_the_lenses() -> None:
     left, right = RIG(spread_points(tensor(60.0, 150.0, 300.0)))[0].unbind(-2)
     right = right + tensor([0.0, 0.4])
-    triangulate = Triangulate(RIG)
+    localize = Localizer(RIG)
 
     def outputs(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        result = triangulate(left, right)
+        result = localize(left, right)
         # The inverse range times the baseline is the parallax, 0.03 to 0.2 rad.
-        return result.points, result.reprojection, 1e4 * result.inverse_range
+        return result.enu, result.reprojection, 1e4 * result.inverse_range
 
     inputs = (left.requires_grad_(), right.requires_grad_())
     # Central differences of pixels: 1e-4 steps against values of 300 m held to 1e-12.
@@ -107,38 +106,38 @@ def test_gradients_through_the_lenses() -> None:
 def test_batches_and_dtypes() -> None:
     points = spread_points(torch.linspace(50, 3000, 12, dtype=torch.float64))
     left, right = RIG(points)[0].unbind(-2)
-    triangulate = Triangulate(RIG)
-    flat = triangulate(left, right)
-    deep = triangulate(left.reshape(2, 1, 6, 2), right.reshape(2, 1, 6, 2))
-    assert deep.points.shape == (2, 1, 6, 3)
+    localize = Localizer(RIG)
+    flat = localize(left, right)
+    deep = localize(left.reshape(2, 1, 6, 2), right.reshape(2, 1, 6, 2))
+    assert deep.enu.shape == (2, 1, 6, 3)
     assert deep.reprojection.shape == (2, 1, 6, 2)
-    for name in ("status", "inverse_range", "inverse_range_sigma", "range_low", "range_high", "bearing_only"):
+    for name in ("status", "inverse_range", "inverse_range_sigma", "range_low", "range_high"):
         assert getattr(deep, name).shape == (2, 1, 6)
-    assert torch.allclose(deep.points.reshape(12, 3), flat.points, rtol=1e-12)
-    assert triangulate(left[:0], right[:0]).points.shape == (0, 3)
+    assert torch.allclose(deep.enu.reshape(12, 3), flat.enu, rtol=1e-12)
+    assert localize(left[:0], right[:0]).enu.shape == (0, 3)
 
-    single = triangulate(left.float(), right.float())
-    assert single.points.dtype == torch.float64
+    single = localize(left.float(), right.float())
+    assert single.enu.dtype == torch.float64
     # The pixels were rounded to 6e-5 px by whoever made them float32; nothing was lost after that.
-    assert torch.equal(single.points, triangulate(left.float().double(), right.float().double()).points)
+    assert torch.equal(single.enu, localize(left.float().double(), right.float().double()).enu)
     with pytest.raises(InputError, match="floating point"):
-        triangulate(left.long(), right.long())
+        localize(left.long(), right.long())
     with pytest.raises(InputError, match="same shape"):
-        triangulate(left, right[:1])
+        localize(left, right[:1])
     with pytest.raises(InputError, match="same shape"):
-        triangulate(left[0], right[0])
+        localize(left[0], right[0])
     for sigma in (0.0, -1.0, float("nan"), float("inf"), 1e300, 1e-300):
         with pytest.raises(InputError, match="pixel_sigma"):
-            Triangulate(RIG, pixel_sigma=sigma)
+            Localizer(RIG, pixel_sigma=sigma)
     camera = RIG.left
     with pytest.raises(DegenerateError, match="same place"):
-        Triangulate(Rig.pair(camera, camera, torch.eye(3), torch.zeros(3)))
+        Localizer(Rig.pair(camera, camera, torch.eye(3), torch.zeros(3)))
 
 
 def test_low_precision_around_the_module_changes_nothing() -> None:
     left, right = RIG(spread_points(torch.linspace(50, 5000, 9, dtype=torch.float64)))[0].unbind(-2)
-    expected = Triangulate(RIG)(left, right)
-    halved = Triangulate(real_rig()).half()
+    expected = Localizer(RIG)(left, right)
+    halved = Localizer(real_rig()).half()
     with torch.autocast("cpu", dtype=torch.bfloat16):
         got = halved(left, right)
     for a, b in zip(expected, got, strict=True):
@@ -161,15 +160,15 @@ BAD_MARKS = [
 def test_statuses_and_no_nan_in_values_or_gradients() -> None:
     left = tensor(*(row[0] for row in BAD_MARKS)).requires_grad_()
     right = tensor(*(row[1] for row in BAD_MARKS)).requires_grad_()
-    result = Triangulate(pinhole_rig())(left, right)
+    result = Localizer(pinhole_rig())(left, right)
     assert result.status.dtype == torch.int8
     assert [PositionStatus(s).name for s in result.status.tolist()] == [row[2].name for row in BAD_MARKS]
     for name, value in result._asdict().items():
         assert not torch.isnan(value).any(), name
-    assert (result.points[1:] == 0).all()
+    assert (result.enu[1:] == 0).all()
     finite = torch.where(torch.isfinite(result.range_high), result.range_high, 0.0)
     low = torch.where(torch.isfinite(result.range_low), result.range_low, 0.0)
-    total = result.points.sum() + result.reprojection.sum() + result.inverse_range.sum() + low.sum() + finite.sum()
+    total = result.enu.sum() + result.reprojection.sum() + result.inverse_range.sum() + low.sum() + finite.sum()
     for gradient in torch.autograd.grad(total, (left, right)):
         assert torch.isfinite(gradient).all()
         assert (gradient[0] != 0).any()
@@ -182,7 +181,7 @@ def test_outside_the_lens() -> None:
         focal=(1000, 1000), center=(2000, 500), size=(4001, 1001), coefficients=[-1 / 12], model="opencv4"
     )
     rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
-    result = Triangulate(rig)(tensor([3400.0, 500.0], [2100.0, 500.0]), tensor([3390.0, 500.0], [2090.0, 500.0]))
+    result = Localizer(rig)(tensor([3400.0, 500.0], [2100.0, 500.0]), tensor([3390.0, 500.0], [2090.0, 500.0]))
     assert [PositionStatus(s).name for s in result.status.tolist()] == ["OUTSIDE_LENS", "OK"]
 
 
@@ -191,22 +190,22 @@ def test_lines_that_cross_behind_one_camera() -> None:
     camera = Camera.build(focal=(800, 800), center=(959.5, 539.5), size=SIZE, model="pinhole")
     rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-1.0, 0.0, -10.0]))
     # The lines meet at (0.5 m, 0, 4 m): 6 m behind the right camera, whose ray leads away from it.
-    behind = Triangulate(rig)(tensor([959.5 + 800 / 8, 539.5]), tensor([959.5 + 800 / 12, 539.5]))
+    behind = Localizer(rig)(tensor([959.5 + 800 / 8, 539.5]), tensor([959.5 + 800 / 12, 539.5]))
     left, right = rig(tensor([3.0, 0.0, 20.0]))[0].unbind(-2)
-    ahead = Triangulate(rig)(left, right)
+    ahead = Localizer(rig)(left, right)
     assert PositionStatus(int(ahead.status)).name == "OK"
     assert PositionStatus(int(behind.status)).name == "BEHIND"
-    assert behind.points.abs().max() == 0
+    assert behind.enu.abs().max() == 0
 
 
 def test_along_the_baseline_there_is_no_range() -> None:
     camera = Camera.build(focal=(800, 800), center=(959.5, 539.5), size=SIZE, model="pinhole")
     rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([0.0, 0.0, -10.0]))
     marks = tensor([959.5, 539.5]).requires_grad_()
-    result = Triangulate(rig)(marks, marks)
+    result = Localizer(rig)(marks, marks)
     assert PositionStatus(int(result.status)).name == "PARALLEL"
     assert (result.range_low.item(), result.range_high.item()) == (0.0, math.inf)
-    assert torch.isfinite(torch.autograd.grad(result.points.sum() + result.inverse_range.sum(), marks)[0]).all()
+    assert torch.isfinite(torch.autograd.grad(result.enu.sum() + result.inverse_range.sum(), marks)[0]).all()
 
 
 def test_parallax_and_its_noise_use_the_local_size_of_a_pixel() -> None:
@@ -215,7 +214,7 @@ def test_parallax_and_its_noise_use_the_local_size_of_a_pixel() -> None:
     # A baseline of 1 mm: both cameras see the point at the same place in the image.
     points = tensor([0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, 0.3, 1.0])
     left, right = rig(points)[0].unbind(-2)
-    result = Triangulate(rig, sigma)(left, right)
+    result = Localizer(rig, pixel_sigma=sigma)(left, right)
     # Along u, off axis by angle a: d(angle)/du = cos²(a) / f; above the axis only the distance grows: cos(a) / f.
     expected = tensor(1.0, 1 / 1.25, 1 / math.sqrt(1.09)) * math.sqrt(2) * sigma / focal
     # The two views differ by 1e-3 in angle, the differences by 1e-8.

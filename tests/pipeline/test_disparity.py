@@ -10,10 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal import Camera, InputError, Rig
+from kcal import Camera, InputError, Localizer, Rig
 from kcal.corners import MatchStatus, patches
 from kcal.lens import rotation_from_vector
-from kcal.locate import Triangulate
 from kcal.pipeline.pairing import DisparityOptions, ObjectDisparities, ObjectDisparity, _brightest, _flagged, _Objects
 from scripts.shared.marking_scene import background
 from scripts.shared.object_scene import exposed, paint_plate, plate, texture_gradient, true_box
@@ -250,8 +249,8 @@ def test_range_of_an_object() -> None:
     """With the rig, boxes err by tens of percent and matching by one."""
     scene = case(3, noise=0.1, amplitude=0.0, box_sigma=1.5)
     middle = 0.5 * (scene.boxes[:, :2] + scene.boxes[:, 2:])
-    locate = Triangulate(scene.rig)
-    ranges = [float(locate(middle, pixels).points[0, 2]) for pixels in (scene.truth, match(scene).pixels, scene.aims)]
+    locate = Localizer(scene.rig)
+    ranges = [float(locate(middle, pixels).enu[0, 2]) for pixels in (scene.truth, match(scene).pixels, scene.aims)]
     assert abs(ranges[1] / ranges[0] - 1) < 0.03
     assert abs(ranges[2] / ranges[0] - 1) > 0.05
 
