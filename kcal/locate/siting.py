@@ -17,9 +17,10 @@ from kcal.lens.pose import enu_from_cam
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Origin, Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, geodetic_to_enu, mean_radius, place_enu
 from kcal.locate.ground import Ground
+from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import station_mounting
 from kcal.locate.tables import TableRow, read_rows
-from kcal.locate.views import CommonErrors, PosedCameras, errors_by_camera, shared_pixels
+from kcal.locate.views import common_variance
 from kcal.texts import brief, briefly
 
 # What the ground hides: lines of sight over a surface of heights, with the Earth's curve and bent light.
@@ -496,8 +497,6 @@ _COLUMNS = (
 )  # fmt: skip
 # Pixels along each axis at which a rig's directions are judged.
 _PLACES = 7
-# Meters: so far away that errors of positions do not count.
-_FAR = 1e8
 
 
 def read_sites(path: str | Path, ground: Ground | None = None) -> list[Site]:
@@ -571,7 +570,7 @@ def sites_of(rig: Rig, pixel_sigma: float = 0.3) -> list[Site]:
         >>> round(site.heading_deg), round(site.sigma_deg, 2), round(site.elevation_sigma_deg, 2)
         (90, 0.2, 0.04)
     """
-    sites = []
+    sites, localize = [], Localizer(rig, weights="all")
     for c, (name, camera) in enumerate(zip(rig.names, rig.each, strict=True)):
         stands = station_mounting(rig, c)
         width, height = camera.size
@@ -587,15 +586,9 @@ def sites_of(rig: Rig, pixel_sigma: float = 0.3) -> list[Site]:
         ]
         spread = torch.full((len(rays), 2), pixel_sigma**2, dtype=torch.float64)
         position = 0.0
-        if rig.root is not None:
-            position = float((stands.covariance[:2, :2].trace() / 2).sqrt()) if stands.covariance is not None else 0.0
-            alone = Rig([camera], [name], rig.rotation[c : c + 1], center=rig.center[c : c + 1], refraction=0.0)
-            first = sum(rig.sizes[:c])
-            columns = torch.cat([rig.root[:, first : first + rig.sizes[c]], rig.root[:, rig.pose_columns(c)]], 1)
-            alone.root = torch.nn.functional.pad(columns, (0, 1))
-            half, bending, lens = errors_by_camera(alone)
-            if half is not None and bending is not None:
-                spread = spread + _common_variance(alone, CommonErrors(lens, half, bending), rays @ rig.rotation[c])
+        if stands.covariance is not None:
+            position = float((stands.covariance[:2, :2].trace() / 2).sqrt())
+        spread = spread + common_variance(localize.posed, localize.common, c, rays @ rig.rotation[c])
         sigma = [float((spread[:, axis].sqrt() * steps[axis]).median()) for axis in (0, 1)]
         sites.append(Site(
             name=name, origin=stands.origin, heading_deg=stands.heading_deg, pitch_deg=stands.pitch_deg,
@@ -603,12 +596,3 @@ def sites_of(rig: Rig, pixel_sigma: float = 0.3) -> list[Site]:
             position_m=position,
         ))  # fmt: skip
     return sites
-
-
-def _common_variance(alone: Rig, common: CommonErrors, rays: Tensor) -> Tensor:
-    """(N, 2) variance that common errors of one camera give its pixels of points far away, in px²."""
-    posed = PosedCameras(alone.each, alone.rotation, alone.center)
-    used = torch.ones(len(rays), 1, dtype=torch.bool)
-    place, inverse = alone.center.expand(len(rays), 3), torch.full((len(rays),), 1.0 / _FAR, dtype=torch.float64)
-    moved = shared_pixels(posed, common, (place, rays, inverse), used, posed.scale)
-    return moved.square().sum(0).T

@@ -41,6 +41,8 @@ from kcal.texts import briefly
 
 # Share of a view's information that the others must be able to check: below, leaving it out tells nothing.
 _UNCHECKED = 1e-9
+# Meters: so far away that errors of positions do not count.
+_FAR = 1e8
 
 
 @briefly
@@ -367,6 +369,17 @@ def shared_pixels(
             pixels = pixels + shared.bending[:, None, None] * by_air
         moved.append(torch.where(used[..., c], pixels, 0.0))
     return torch.cat(moved, -2)
+
+
+def common_variance(posed: PosedCameras, common: CommonErrors | None, camera: int, rays: Tensor) -> Tensor:
+    """(N, 2) variance that common errors of a camera give its pixels of what is far away along rays (N, 3), px²."""
+    if common is None:
+        return torch.zeros_like(rays[:, :2])
+    alone = PosedCameras(posed.cameras[camera : camera + 1], *(part[[camera]] for part in posed[1:3]))
+    common = CommonErrors(common.lens[camera : camera + 1], common.half[:, [camera]], common.bending)
+    at = alone.center.expand_as(rays), rays, torch.full_like(rays[:, 0], 1.0 / _FAR)
+    moved = shared_pixels(alone, common, at, torch.ones_like(rays[:, :1], dtype=torch.bool), alone.scale)
+    return moved.square().sum(0).T
 
 
 def _weight(cov: Tensor | None, noise: Tensor | float, used: Tensor, moved: Tensor | None) -> Tensor:

@@ -10,19 +10,19 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from kcal.checks import StatedModule, as_points, exportable
 from kcal.corners.patches import as_gray
 from kcal.dispatch import is_differentiated, still
 from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from kcal.lens.rig import Rig
-from kcal.lens.uncertainty import pixel_slopes
 from kcal.locate.localizer import Localizer
-from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, fit_views
+from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, common_variance, fit_views
 from kcal.pipeline.assignment import assign_groups
 from kcal.pipeline.detections import Anchor, Detections, box_anchors
+from kcal.pipeline.epipolar_pencil import StationSights, in_range, near_in_angle
 from kcal.texts import briefly
 
 # `AssociationOptions`: which detections may be of one object.
@@ -63,142 +63,64 @@ class AssociationOptions:
 
 # Which pairs of pixels can be of one object at all: a cheap test that comes before any point is fitted.
 #
-# Two rays meet where rayᵀ_right E ray_left is zero. How far it may be from zero follows, to first order, from the noise
-# of the pixels and the errors of the rig. Rays and their derivatives are computed once for each pixel, and a pair costs
-# a few products. Far from the line, the fit of a point may also stop at a false optimum; such pairs end here.
+# Far from the epipolar line, the fit of a point may also stop at a false optimum; such pairs end here.
 
-# The band is this many times as wide as the errors to first order say, for lenses that bend within it.
-_SLACK = 1.5
-
-
+# The band is this many times as wide as the errors to first order say, for lenses that bend within it, and whose pixels
+# are wider one way than the other.
+_SLACK = 2.0
 # Ranges from the left camera and from the rig's middle differ by this ratio at most, from 2 baselines on.
 _MIDDLE = 1.25
-# Numbers that are held at once.
-_AT_ONCE = 1 << 20
 
 
-class _Rays(NamedTuple):
-    """N rays of a camera, in the frame of the right one.
+def station_sights(
+    localize: Localizer, camera: NDArray[np.int64], pixels: Tensor, sigma: float
+) -> tuple[StationSights, NDArray[np.bool_]]:
+    """Lines of sight of pixels (N, 2) of cameras (N,), which err by `sigma` px and all common errors; which exist."""
+    posed, common = localize.posed, localize.common
+    place, air = torch.zeros_like(posed.center[:, 0]), 0.0
+    if common is not None:
+        place = common.half[..., :3].square().sum(0).sqrt().amax(-1)
+        air = float(common.bending.square().sum().sqrt())
+    ray, wide = posed.center.new_zeros(len(camera), 3), posed.center.new_ones(len(camera))
+    there = torch.zeros_like(wide, dtype=torch.bool)
+    for c, lens in enumerate(posed.cameras):
+        own = torch.from_numpy(np.flatnonzero(camera == c)).to(ray.device)
+        marks = pixels[own]
+        rays, valid = lens.unproject(
+            torch.stack([marks, marks + marks.new_tensor([1, 0]), marks + marks.new_tensor([0, 1])])
+        )
+        slope = (rays[1:] - rays[:1]).square().sum((0, -1)) / 2.0
+        ray[own], there[own] = rays[0] @ posed.rotation[c], valid[0]
+        wide[own] = (slope * (sigma**2 + common_variance(posed, common, c, ray[own]).amax(-1))).sqrt()
+    up = torch.zeros_like(posed.center) if posed.up is None else posed.up
+    numbers = (value.cpu().numpy() for value in (ray, wide, place))
+    center, up = posed.center.cpu().numpy(), up.cpu().numpy()
+    return StationSights(camera, *numbers, air, center, up, float(posed.bending)), there.cpu().numpy()
 
-    Attributes:
-        ray: (N, 3).
-        by_pixel: (N, 3, 2) turns of it by a pixel.
-        by_error: (N, 3, K) turns of it by the errors of the rig.
-    """
 
-    ray: Tensor
-    by_pixel: Tensor
-    by_error: Tensor
-
-    def at(self, which: Tensor | tuple[Tensor, Tensor]) -> _Rays:
-        return _Rays(*(value[which] for value in self))
-
-    def split(self, moments: int) -> _Rays:
-        """Those of so many time steps: (B, N / B, ...)."""
-        return _Rays(*(value.unflatten(0, (moments, -1)) for value in self))
-
-
-def near_epipolar_lines(
-    rig: Rig,
-    left: Tensor,
-    right: Tensor,
-    sigma: float,
-    gate: float,
-    ranges: tuple[float, float] | None = None,
-) -> Tensor:
-    """(..., N, M) bool: False only where the epipolar error is beyond `gate` standard deviations for certain.
+def near_lines(localize: Localizer, anchors: Sequence[Tensor], options: AssociationOptions, nearest: float) -> Tensor:
+    """(B, N, M) bool: False only for pairs of pixels (B, N, 2) and (B, M, 2) that are of no point for certain.
 
     Args:
-        rig: the calibrated cameras; errors of its `covariance` widen the band.
-        left: (..., N, 2) float64 pixels.
-        right: (..., M, 2), with the same leading dimensions: time steps, which are not compared with each other.
-        sigma: standard deviation of every pixel along each axis.
-        gate: standard deviations.
-        ranges: nearest and farthest, meters: pairs beyond them by as many standard deviations are left out, too.
-
-    Example:
-        >>> from kcal.rig import planned_rig
-        >>> left = torch.tensor([[960.0, 540.0]], dtype=torch.float64)
-        >>> right = torch.tensor([[944.0, 541.0], [944.0, 640.0]], dtype=torch.float64)
-        >>> near_epipolar_lines(planned_rig(), left, right, 1.0, 4.0).tolist()
-        [[True, False]]
+        localize: of two cameras, with weights by all errors.
+        anchors: left and right pixels.
+        options: their noise, the gate, and the largest range.
+        nearest: the smallest range, meters.
     """
-    rotation, shift = rig.right_from_left_rotation, rig.right_from_left_translation
-    sizes = (rig.left.values.shape[-1], rig.right.values.shape[-1], 3, 3)
-    errors = rig.covariance
-    known = shift.new_zeros(0, sum(sizes)) if errors is None else errors.half.to(shift)
-    own = known.T.split(sizes)
-    near = torch.zeros(*left.shape[:-1], right.shape[-2], dtype=torch.bool, device=left.device)
-    if not near.numel():
-        return near
-    whole = near.reshape(-1, *near.shape[-2:])
-    ray, by_pixel, by_error = _turns(rig.left, left.reshape(-1, 2), own[0])
-    first = _Rays(ray @ rotation.T, rotation @ by_pixel, own[2] - rotation @ by_error).split(len(whole))
-    other = _Rays(*_turns(rig.right, right.reshape(-1, 2), own[1])).split(len(whole))
-    shifts = shift, own[3]
-    pairs = whole[0].numel()
-    for moments in torch.arange(len(whole), device=left.device).split(_AT_ONCE // (32 * pairs) + 1):
-        seen = other.at(moments)
-        for rows in torch.arange(left.shape[-2], device=left.device).split(_AT_ONCE // (32 * right.shape[-2]) + 1):
-            part = first.at((moments[:, None], rows))
-            whole[moments[:, None], rows] = _possible(part, seen, shifts, sigma, _SLACK * gate, ranges)
-    return near
-
-
-def _possible(
-    first: _Rays,
-    other: _Rays,
-    shifts: tuple[Tensor, Tensor],
-    sigma: float,
-    gate: float,
-    ranges: tuple[float, float] | None,
-) -> Tensor:
-    """(B, N, M) bool."""
-    shift, by_shift = shifts
-    turned, rays = first.ray[..., None, :], other.ray[:, None]
-    across = torch.linalg.cross(rays, shift.expand_as(rays))
-    shifted = torch.linalg.cross(*torch.broadcast_tensors(turned, rays))
-    error = (turned * across).sum(-1)
-    # Derivatives of the error (B, N, M, 3) by turns of the left rays about the right camera's axes, and of right rays.
-    by_turn = torch.linalg.cross(*torch.broadcast_tensors(turned, across))
-    by_other = torch.linalg.cross(*torch.broadcast_tensors(rays, torch.linalg.cross(shift.expand_as(turned), turned)))
-    marks = (by_turn @ first.by_pixel).square().sum(-1)
-    marks = marks + (by_other.transpose(1, 2) @ other.by_pixel).square().sum(-1).mT
-    # Squares of what the errors of the rig add together, by their products: no K for each pair.
-    left, right = first.by_error, other.by_error
-    back, cross = by_other.transpose(1, 2), left.flatten(1, 2) @ right.flatten(1, 2).mT
-    cross = cross.unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).transpose(2, 3)  # (B, N, M, 3, 3)
-    moved = ((by_turn @ (left @ left.mT)) * by_turn).sum(-1) + ((back @ (right @ right.mT)) * back).sum(-1).mT
-    moved = moved - 2.0 * ((by_turn[..., None, :] @ cross)[..., 0, :] * by_other).sum(-1)
-    with_shift = 2.0 * (by_turn @ (left @ by_shift.T)) - 2.0 * (back @ (right @ by_shift.T)).transpose(1, 2)
-    moved = moved + ((with_shift + shifted @ (by_shift @ by_shift.T)) * shifted).sum(-1)
-    # What products of two turns add at most.
-    turns = first.by_pixel.square().sum((-2, -1))[..., None], other.by_pixel.square().sum((-2, -1))[:, None]
-    second = (gate * sigma) ** 2 * (turns[0] + turns[1])
-    baseline = torch.linalg.vector_norm(shift)
-    near = error.abs() <= gate * (sigma**2 * marks + moved.clamp_min(0.0)).sqrt() + second * baseline
-    if ranges is None:
-        return near
-    # A point at the inverse distance q is seen where the cross product of its rays is q times that with the baseline.
-    length = torch.linalg.vector_norm(across, dim=-1).clamp_min(1e-12)
-    inverse = (shifted * across).sum(-1) / length.square()
-    errors = first.by_error.square().sum((-2, -1))[..., None], other.by_error.square().sum((-2, -1))[:, None]
-    own = [(sigma**2 * turn).sqrt() + error.sqrt() for turn, error in zip(turns, errors, strict=True)]
-    stretch = (own[1] * baseline + by_shift.square().sum().sqrt()) / length
-    reach = gate * ((own[0] + own[1]) / length + inverse.abs() * stretch) + second / length
-    beyond = inverse + reach < 1.0 / (_MIDDLE * ranges[1])
-    before = inverse - reach > _MIDDLE / ranges[0]
-    # Near the baseline's own direction nothing is said of the distance.
-    return near & ~((beyond | before) & (gate * stretch < 0.3))
-
-
-def _turns(camera: Camera, pixels: Tensor, half: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rays (N, 3), turns of them (N, 3, 2) by a pixel and (N, 3, K) by the K errors of the camera's parameters."""
-    rays, _ = camera.unproject(pixels)
-    by_camera, by_motion, _ = pixel_slopes(camera, rays, torch.inf, list(range(len(half))))
-    by_turn = by_motion[..., :3]
-    turns = by_turn.mT @ torch.linalg.inv_ex(by_turn @ by_turn.mT)[0]
-    return rays, turns, turns @ (by_camera @ half)
+    (moments, rows), columns = anchors[0].shape[:2], anchors[1].shape[1]
+    near, count = np.zeros((moments, rows, columns), dtype=bool), moments * rows
+    if near.size:
+        camera = np.repeat([0, 1], [count, moments * columns])
+        pixels = torch.cat([some.flatten(0, 1) for some in anchors])
+        lines, there = station_sights(localize, camera, pixels, options.box_sigma)
+        gate, ranges = _SLACK * options.gate, (nearest / _MIDDLE, options.farthest * _MIDDLE)
+        for own, other in zip(
+            *(part.reshape(moments, -1) for part in np.split(np.arange(len(camera)), [count])), strict=True
+        ):
+            first, second = near_in_angle(lines, own[there[own]], other[there[other]], gate, nearest)
+            kept = in_range(lines, (first, second), gate, ranges)
+            near[first[kept] // rows, first[kept] % rows, (second[kept] - count) % columns] = True
+    return torch.from_numpy(near).to(anchors[0].device)
 
 
 # What a pair of detections costs: squared standard deviations of what no point explains, of its range and its size.
@@ -490,7 +412,7 @@ class PairBoxes(StatedModule):
         )
         cost = found.cost[moments, rows, columns]
         if is_differentiated(both) and len(rows):
-            fitted = _costs(still(self.rig), pixels, both, self.options)
+            fitted = _costs(_unplaced(still(self.rig)), pixels, both, self.options, _nearest(self.rig, self.options))
             cost = cost + torch.nan_to_num(fitted - fitted.detach())
         middles = [0.5 * (score.new_tensor(camera.size) - 1.0) for camera in (self.rig.left, self.rig.right)]
         seen = [middle.expand(*mask.shape, 2).index_put((moments, rows), pixel)
@@ -540,9 +462,13 @@ def _paired(
     for word, some in zip(("left", "right"), boxes, strict=True):
         if some.shape[1] > MOST_BOXES:
             raise InputError(f"{some.shape[1]:,} {word} detections in one image; at most {MOST_BOXES:,} can be paired")
-    ranges = _nearest(rig, options), options.farthest
-    near = near & near_epipolar_lines(rig, anchors[0], anchors[1], options.box_sigma, options.gate, ranges)
-    cost = association_costs(rig, anchors, boxes, near, options)
+    localize, nearest = _unplaced(rig), _nearest(rig, options)
+    near = near & near_lines(localize, anchors, options, nearest)
+    cost = torch.full_like(near, torch.inf, dtype=torch.float64)
+    moments, rows, columns = near.nonzero(as_tuple=True)
+    if len(rows):
+        both = [torch.stack([one[moments, rows], other[moments, columns]], 1) for one, other in (anchors, boxes)]
+        cost[moments, rows, columns] = _costs(localize, both[0], both[1], options, nearest)
     if images is not None:
         shapes = [some.shape for some in images]
         if shapes != [(len(near), *camera.size[::-1]) for camera in (rig.left, rig.right)]:
@@ -561,31 +487,17 @@ def _paired(
     return _Paired(chosen, doubts & (chosen >= 0), cost, possible)
 
 
-def _costs(rig: Rig, pixels: Tensor, boxes: Tensor, options: AssociationOptions) -> Tensor:
-    """(L,) squared standard deviations of what no point explains, of range and size; pixels (L, 2, 2), boxes (L, 2, 4).
-
-    Infinite where impossible; differentiable by both.
-    """
-    # Where a mast stands does not matter.
+def _unplaced(rig: Rig) -> Localizer:
+    """With weights by all errors of two cameras; where their mast stands does not matter."""
     alone = copy.copy(rig)
     alone.mounting = None
-    localize, both = Localizer(alone, weights="all"), torch.tensor([0, 1]).expand(len(pixels), 2)
-    return pair_costs(localize, both, pixels, boxes, options, _nearest(rig, options)).cost
+    return Localizer(alone, weights="all")
 
 
-def association_costs(
-    rig: Rig, anchors: Sequence[Tensor], boxes: Sequence[Tensor], among: Tensor, options: AssociationOptions
-) -> Tensor:
-    """(B, N, M) squared standard deviations of epipolar error, range and size of pairs; infinite where impossible.
-
-    Of anchors (B, N, 2) and (B, M, 2) of boxes (B, N, 4) and (B, M, 4), where `among` (B, N, M) is true.
-    """
-    cost = torch.full_like(among, torch.inf, dtype=torch.float64)
-    moments, rows, columns = among.nonzero(as_tuple=True)
-    if len(rows):
-        both = [torch.stack([one[moments, rows], other[moments, columns]], 1) for one, other in (anchors, boxes)]
-        cost[moments, rows, columns] = _costs(rig, both[0], both[1], options)
-    return cost
+def _costs(localize: Localizer, pixels: Tensor, boxes: Tensor, options: AssociationOptions, nearest: float) -> Tensor:
+    """(L,) squared standard deviations, given pixels (L, 2, 2) and boxes (L, 2, 4) of left and right."""
+    both = torch.tensor([0, 1]).expand(len(pixels), 2)
+    return pair_costs(localize, both, pixels, boxes, options, nearest).cost
 
 
 def _nearest(rig: Rig, options: AssociationOptions) -> float:

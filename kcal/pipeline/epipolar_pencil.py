@@ -137,6 +137,8 @@ def near_in_angle(lines: StationSights, rows: Ints, others: Ints, gate: float, n
 
     Cameras in one place have no such planes: no pairs.
     """
+    if not len(rows) or not len(others):
+        return rows[:0], others[:0]
     shift = lines.center[lines.camera[others[0]]] - lines.center[lines.camera[rows[0]]]
     length = float(np.linalg.norm(shift))
     if not length:
@@ -151,7 +153,9 @@ def near_in_angle(lines: StationSights, rows: Ints, others: Ints, gate: float, n
         angles.append(np.arctan2(y, x))
         unsure = lines.place[lines.camera[which[0]]] / nearest
         wide = gate * np.hypot(lines.sigma[which], unsure) + (lines.bending + gate * lines.air) * FARTHEST_BEND_M
-        widths.append(np.minimum(wide / np.maximum(np.hypot(x, y), 1e-12), np.pi))
+        # Within the noise of the line through both cameras, any plane is possible.
+        ratio = wide / np.maximum(np.hypot(x, y), 1e-12)
+        widths.append(np.where(ratio < 1.0, np.arcsin(np.minimum(ratio, 1.0)), np.pi))
     # Around the circle: each angle of the others thrice.
     turns = (angles[1] + 2.0 * np.pi * np.array([[-1.0], [0.0], [1.0]])).ravel()
     order = np.argsort(turns)
@@ -163,6 +167,21 @@ def near_in_angle(lines: StationSights, rows: Ints, others: Ints, gate: float, n
     second = order[place] % len(others)
     kept = np.abs(ordered[place] - angles[0][first]) <= np.hypot(widths[0][first], widths[1][second])
     return rows[first[kept]], others[second[kept]]
+
+
+def in_range(lines: StationSights, pairs: tuple[Ints, Ints], gate: float, ranges: tuple[float, float]) -> Floats:
+    """(L,) bool: pairs of straight lines that may meet between two ranges from the first camera, within the noise."""
+    u, v = (lines.ray[which] for which in pairs)
+    a, b = (lines.camera[which] for which in pairs)
+    shift = lines.center[b] - lines.center[a]
+    across = np.cross(shift, v)
+    length = np.maximum(np.linalg.norm(across, axis=1), 1e-12)
+    inverse = (np.cross(u, v) * across).sum(1) / length**2
+    place = np.hypot(lines.place[a], lines.place[b])
+    stretch = (lines.sigma[pairs[1]] * np.linalg.norm(shift, axis=1) + place) / length
+    reach = gate * ((lines.sigma[pairs[0]] + lines.sigma[pairs[1]]) / length + np.abs(inverse) * stretch)
+    # Near the line through both cameras nothing is said of the distance.
+    return (gate * stretch > 0.3) | ((inverse + reach >= 1.0 / ranges[1]) & (inverse - reach <= 1.0 / ranges[0]))
 
 
 def _ranges(u: Floats, v: Floats, base: Floats, length: float) -> tuple[Floats, Floats]:

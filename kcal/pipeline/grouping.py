@@ -21,9 +21,9 @@ from kcal.lens.rig import Rig
 from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks
 from kcal.pipeline.assignment import assign_groups
-from kcal.pipeline.association import MOST_BOXES, AssociationOptions, fit_some, pair_costs
+from kcal.pipeline.association import MOST_BOXES, AssociationOptions, fit_some, pair_costs, station_sights
 from kcal.pipeline.detections import Detections
-from kcal.pipeline.epipolar_pencil import FEWEST_VIEWS, Confirming, StationSights, near_in_angle, separate_pairs
+from kcal.pipeline.epipolar_pencil import FEWEST_VIEWS, Confirming, near_in_angle, separate_pairs
 from kcal.pipeline.pairing import ObjectViews, pair_objects
 
 # `group_objects`: which detections of any number of cameras are of one target, by where their lines of sight meet.
@@ -152,7 +152,9 @@ class _Scene:
         names = {name: number for number, name in enumerate(dict.fromkeys(self.category))}
         self.kind = np.array([names[name] for name in self.category], dtype=np.int64)
         self.own = [np.flatnonzero(self.camera == c) for c in range(len(localize.rig))]
-        self.lines = self._lines()
+        self.lines, valid = station_sights(localize, self.camera, self.pixels, options.box_sigma)
+        # What has no line of sight stays alone.
+        self.own = [own[valid[own]] for own in self.own]
 
     def chosen(self) -> list[_Group]:
         """Groups of two views and more, each detection once."""
@@ -210,35 +212,6 @@ class _Scene:
         rays, valid = camera.unproject(edge)
         widest = torch.where(valid, rays @ middle, -1.0).amax()
         return (turn.T @ middle).numpy(), widest.numpy()
-
-    def _lines(self) -> StationSights:
-        """Lines of sight of all detections."""
-        posed, common = self.posed, self.localize.common
-        moved, turned, air = torch.zeros(len(self.own)).double(), torch.zeros(len(self.own)).double(), 0.0
-        if common is not None:
-            moved, turned = common.half[..., :6].square().sum(0).sqrt().unflatten(-1, (2, 3)).amax(-1).unbind(-1)
-            air = float(common.bending.square().sum().sqrt())
-        ray, sigma = torch.zeros(len(self.camera), 3, dtype=torch.float64), torch.ones(len(self.camera)).double()
-        for c, own in enumerate(self.own):
-            camera, pixels = posed.cameras[c], self.pixels[own]
-            steps = torch.stack([pixels, pixels + torch.tensor([1.0, 0.0]), pixels + torch.tensor([0.0, 1.0])])
-            rays, valid = camera.unproject(steps)
-            # What has no line of sight stays alone.
-            self.own[c] = own[valid[0].numpy()]
-            slope = (rays[1:] - rays[:1]).square().sum((0, -1)) / 2.0
-            ray[own] = rays[0] @ posed.rotation[c]
-            sigma[own] = (slope * self.options.box_sigma**2 + turned[c].square()).sqrt()
-        up = torch.zeros_like(posed.center) if posed.up is None else posed.up
-        return StationSights(
-            self.camera,
-            ray.numpy(),
-            sigma.numpy(),
-            moved.numpy(),
-            air,
-            posed.center.numpy(),
-            up.numpy(),
-            float(posed.bending),
-        )
 
     def _remaining(self) -> list[_Group]:
         """Groups of what no clear group has."""

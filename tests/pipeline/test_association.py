@@ -13,7 +13,15 @@ from kcal import Camera, InputError, Rig
 from kcal.lens import rotation_from_vector
 from kcal.locate.views import PosedCameras, fit_views
 from kcal.pipeline.assignment import assign_groups, best_assignment
-from kcal.pipeline.association import Association, AssociationOptions, associate, association_costs, near_epipolar_lines
+from kcal.pipeline.association import (
+    Association,
+    AssociationOptions,
+    _costs,
+    _nearest,
+    _unplaced,
+    associate,
+    near_lines,
+)
 from kcal.rig import RigCovariance
 from kcal.track import Detections
 
@@ -51,8 +59,12 @@ def costs_of(
 ) -> Tensor:
     """(N, M) of one moment."""
     among = torch.ones(len(left), len(right), dtype=torch.bool) if among is None else among
-    both = [left.anchors()[None], right.anchors()[None]], [left.boxes[None], right.boxes[None]]
-    return association_costs(rig, *both, among[None], options)[0]
+    rows, columns = among.nonzero(as_tuple=True)
+    pixels = torch.stack([left.anchors()[rows], right.anchors()[columns]], 1)
+    boxes = torch.stack([left.boxes[rows], right.boxes[columns]], 1)
+    cost = torch.full(among.shape, torch.inf, dtype=torch.float64)
+    cost[rows, columns] = _costs(_unplaced(rig), pixels, boxes, options, _nearest(rig, options))
+    return cost
 
 
 def test_targets_find_each_other() -> None:
@@ -120,8 +132,7 @@ def test_the_band_leaves_out_no_pair_that_is_possible(kind: str, share: float) -
     options = AssociationOptions(box_sigma=2.0, nearest=5.0)
     size = torch.tensor(SIZE, dtype=torch.float64)
     left, right = (seen(torch.rand(120, 2, generator=random, dtype=torch.float64) * size) for _ in range(2))
-    anchors, ranges = (left.anchors(), right.anchors()), (5.0, options.farthest)
-    near = near_epipolar_lines(rig, *anchors, options.box_sigma, options.gate, ranges)
+    (near,) = near_lines(_unplaced(rig), (left.anchors()[None], right.anchors()[None]), options, 5.0)
     every = costs_of(rig, left, right, options)
     possible = every < options.gate**2
     assert not bool((possible & ~near).any())

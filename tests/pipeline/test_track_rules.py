@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 import torch
 from scipy.special import chdtrc
-from torch import Tensor
 from track_scenes import pairs_of, tracked_site
 
-from kcal import Camera, Rig
-from kcal.lens import rotation_from_vector
-from kcal.pipeline.association import _patches, appearance, near_epipolar_lines
+from kcal.pipeline.association import _patches, appearance
 from kcal.pipeline.pairing import ObjectViews
 from kcal.pipeline.tracks import Tracker, TrackOptions, TrackRecord, _toward
 from kcal.track import Motion
@@ -154,61 +151,6 @@ class TestRules:
             torch.testing.assert_close(turn[..., k] @ ray / ray.norm(), still[2])
             torch.testing.assert_close(turn[..., k] @ turn[..., k].T, still)
             torch.testing.assert_close(torch.linalg.cross(turn[0, :, k], turn[1, :, k]), turn[2, :, k])
-
-
-class TestBands:
-    RIG = Rig.pair(
-        Camera.build(focal=(800, 810), center=(320, 240), size=(640, 480), model="pinhole"),
-        Camera.build(focal=(790, 780), center=(315, 250), size=(640, 480), model="pinhole"),
-        rotation_from_vector(torch.tensor([0.01, -0.02, 0.1], dtype=torch.float64)),
-        torch.tensor([-2.0, 0.1, 0.2], dtype=torch.float64),
-    )
-
-    def error(self, left: Tensor, right: Tensor) -> float:
-        rig = self.RIG
-        ray, other = rig.left.unproject(left[None])[0][0], rig.right.unproject(right[None])[0][0]
-        turned = rig.right_from_left_rotation @ ray
-        return float(turned @ torch.linalg.cross(other, rig.right_from_left_translation))
-
-    @pytest.mark.parametrize("sigma", [0.5, 3.0])
-    def test_as_wide_as_noise_of_both_pixels(self, sigma: float) -> None:
-        """One and a half times four standard deviations to first order, and what products of two turns add."""
-        left = torch.tensor([400.0, 200.0]).double()
-        ray = self.RIG.right_from_left_rotation @ self.RIG.left.unproject(left[None])[0][0]
-        there, _ = self.RIG.right.project(ray[None] * 60.0 + self.RIG.right_from_left_translation)
-        steps = 1e-3 * torch.eye(2).double()
-        gate = 1.5 * 4.0
-        compared = 0
-        for up in np.linspace(-60.0, 60.0, 61):
-            right = there[0] + torch.tensor([0.0, float(up)])
-            slopes = [(self.error(left + s, right) - self.error(left - s, right)) / 2e-3 for s in steps]
-            slopes += [(self.error(left, right + s) - self.error(left, right - s)) / 2e-3 for s in steps]
-            first = gate * sigma * math.sqrt(sum(slope**2 for slope in slopes))
-            turns = 0.0
-            for camera, pixel in ((self.RIG.left, left), (self.RIG.right, right)):
-                for s in steps:
-                    both = camera.unproject(torch.stack([pixel + s, pixel - s]))[0]
-                    turns += float((both[0] - both[1]).square().sum()) / 4e-6
-            second = (gate * sigma) ** 2 * turns * float(self.RIG.right_from_left_translation.norm())
-            share = abs(self.error(left, right)) / (first + second)
-            if abs(share - 1.0) > 1e-3:
-                near = near_epipolar_lines(self.RIG, left[None], right[None], sigma, 4.0)
-                assert bool(near[0, 0]) is (share < 1.0), share
-                compared += share > 1.0
-        assert 10 < compared < 58
-
-    def test_ranges_by_a_quarter_beyond_both_ends(self) -> None:
-        """Of exact marks on the epipolar line: what is certainly nearer or farther is left out."""
-        pixel = torch.tensor([[330.0, 230.0]]).double()
-        ray = self.RIG.left.unproject(pixel)[0]
-        ray = ray / ray.norm()
-        for away, kept in ((70.0, False), (78.5, False), (81.5, True), (300.0, True), (1235.0, True), (1265.0, False)):
-            points = ray * away @ self.RIG.right_from_left_rotation.T + self.RIG.right_from_left_translation
-            right, _ = self.RIG.right.project(points)
-            near = near_epipolar_lines(self.RIG, pixel, right, 1e-4, 4.0, (100.0, 1000.0))
-            assert bool(near[0, 0]) is kept, away
-            # Wider noise leaves more open.
-            assert bool(near_epipolar_lines(self.RIG, pixel, right, 3.0, 4.0, (100.0, 1000.0))[0, 0])
 
 
 class TestLooks:
