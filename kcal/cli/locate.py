@@ -19,8 +19,8 @@ from kcal.errors import DegenerateError, InputError
 from kcal.files import written_files
 from kcal.texts import one_line
 
-# Positions; where bearings count from, of several cameras; whether the table states noise; how far it is read.
-LocatedPart: TypeAlias = "tuple[rooms.PositionColumns, rooms.Tensor | None, bool, int]"
+# Positions; whether the table states noise; how far it is read.
+LocatedPart: TypeAlias = "tuple[rooms.PositionColumns, bool, int]"
 
 
 # What `kcal locate` prints and draws of positions.
@@ -130,7 +130,7 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[rooms.Point
         raise typer.BadParameter("--aged guesses what --history tells: give either")
     noise, note = pixel_sigma_and_source(own.pixel_sigma, solved)
     warn(*(f"{rig}: {text}" for text in (solved.calibration.warnings if solved.calibration else ())))
-    by_moments: Callable[[kcal.locate.Marks], tuple[rooms.PositionColumns, rooms.Tensor | None]] | None = None
+    by_moments: Callable[[kcal.locate.Marks], rooms.PositionColumns] | None = None
     geoid = kcal.locate.find_geoid(own.geoid_grid)
     if many:
         ground = None if own.terrain is None else kcal.locate.terrain(own.terrain, own.geoid)
@@ -151,8 +151,7 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[rooms.Point
 
     def parts() -> Iterator[LocatedPart]:
         for marks, read in rooms.read_mark_chunks(points, solved.names, single=many):
-            columns, feet = (by_moments or locate)(marks)
-            yield columns, feet, marks.covariance_or(noise) is not None, read
+            yield (by_moments or locate)(marks), marks.covariance_or(noise) is not None, read
 
     return locate, parts(), note
 
@@ -297,11 +296,11 @@ def locate_command(
             size = points.stat().st_size if points.is_file() else None
             with rooms.open_writers(outputs, empty, suffix) as writers, steps("locating", size) as advance:
                 read, stated = 0, False
-                for columns, feet, known, end in parts:
+                for columns, known, end in parts:
                     stated = stated or known
                     for writer in writers:
                         writer.add(columns)
-                    sample.add(columns, feet)
+                    sample.add(columns)
                     advance(f"{sample.count:,} rows", end - read)
                     read = end
                 if note and not stated:
@@ -309,7 +308,7 @@ def locate_command(
                 located = sample.located(locate)
                 true = None if truth is None else rooms.read_truth(truth, located)
             if picture is not None:
-                draw = kcal.report.positions_figure if located.feet is None else rooms.stations_figure
+                draw = kcal.report.positions_figure if located.centers is None else rooms.stations_figure
                 kcal.report.save_picture(picture, draw(located, true))
             if map_ is not None:
                 kcal.report.save_map(map_, located, true, tiles=tiles, image=image, online=online)
@@ -327,6 +326,6 @@ def locate_command(
         _print_positions(located, true, sample.statuses, stated=stated)
         print_wrote(*written)
     if "ok" not in sample.statuses:
-        rows = "pairs" if located.feet is None else "points"
+        rows = "pairs" if located.centers is None else "points"
         text = f"{points}: none of the {sample.count} {rows} could be located; see the table"
         raise DegenerateError(console.with_command(text, console.mark_again("--rig", rig)))

@@ -200,8 +200,7 @@ def _of_table(file: Path, kind: str, localize: kcal.Localizer, note: str) -> roo
             single = single or rooms.is_long(file)
             chunks = (marks for marks, _ in rooms.read_mark_chunks(file, names, single=single))
         locate = rooms.PointLocator(localize.weighing_all()) if single else locate
-        parts, feet = zip(*map(locate, chunks), strict=True)
-        located = locate.located(rooms.PositionColumns.joined(parts), rooms.torch.cat(feet) if single else None)
+        located = locate.located(rooms.PositionColumns.joined([*map(locate, chunks)]))
         if note:
             err.print(note)
     codes = located.columns.status.tolist()

@@ -91,7 +91,7 @@ def kml_regions(columns: PositionColumns, run: Located) -> str:
     """A polygon for each row that has a position."""
     names = [columns.names[i] for i in np.flatnonzero(columns.located).tolist()]
     placemarks = []
-    rings = (ring for block in ring_blocks(columns, run.place, plain=run.feet is not None) for ring in block)
+    rings = (ring for block in ring_blocks(columns, run) for ring in block)
     for name, ring in zip(names, rings, strict=True):
         corners = np.stack([(ring[:, 1] + 180.0) % 360.0 - 180.0, ring[:, 0]], -1)
         places = number_lines(corners.round(CORNER_DECIMALS))
@@ -171,7 +171,7 @@ def point_features(columns: PositionColumns) -> Iterator[bytes]:
 def region_features(columns: PositionColumns, run: Located) -> Iterator[bytes]:
     """A polygon for each position: its 95 % region, a long and slightly skewed ellipse."""
     names = iter([columns.names[place] for place in np.flatnonzero(columns.located).tolist()])
-    for block in ring_blocks(columns, run.place, plain=run.feet is not None):
+    for block in ring_blocks(columns, run):
         corners = np.ascontiguousarray(block[..., ::-1]).round(CORNER_DECIMALS)
         beyond = (np.abs(block[..., 1]).max(-1) > 180.0).tolist()
         # Section 3.1.6: closed, counterclockwise; section 3.1.9: a polygon across the antimeridian is cut in two.
@@ -607,16 +607,16 @@ def read_positions(path: str | Path, locate: PointLocator) -> Located:
         except (KeyError, ValueError) as error:
             raise FileError(f"{path}: lines {chunk.lines[0]} to {chunk.lines[-1]}: {error} is none of kcal") from error
         extras = {name: texts for name, texts in cells.items() if name not in known}
-        parts.append(PositionColumns(chunk.names, status, cells["reason"], numbers, extras))
+        parts.append(PositionColumns(chunk.names, status, cells["reason"], numbers, extras, np.zeros(len(status), int)))
     columns = PositionColumns.joined(parts)
     there = torch.from_numpy(columns.numbers[columns.located])
     if run.origin and bool(((geodetic_to_enu(there[:, :3], run.origin) - there[:, 4:7]).norm(dim=-1) > _ROUNDED).any()):
         raise FileError(f"{path}: positions of another rig: this one counts from {run.origin}")
-    if run.feet is None:
-        return locate.located(columns)
-    cameras = columns.extras.get("told_from", columns.extras.get("cameras", [""] * len(columns.names)))
-    anchors = [text.split(" ")[0] for text in cameras]
+    cameras = columns.extras.get("told_from", columns.extras.get("cameras", []))
+    anchors = [] if run.centers is None else [text.split(" ")[0] for text in cameras]
     rig = locate.localize.rig
     if other := next((name for name in anchors if name and name not in rig.names), None):
         raise FileError(f"{path}: positions of another rig: this one has no camera {other!r}")
-    return locate.located(columns, rig.center.cpu()[[rig.names.index(name) if name else 0 for name in anchors]])
+    for row, name in enumerate(anchors):
+        columns.anchor[row] = rig.names.index(name) if name else 0
+    return locate.located(columns)

@@ -93,11 +93,8 @@ def locate_points(
         raise InputError("marks: no row of marks; at least one is needed")
     if len(marks.names) != len(marks.pixels):
         raise InputError(f"marks: {len(marks.names)} names for {len(marks.pixels)} rows; one each is needed")
-    columns, feet = zip(
-        *(locate(marks.rows(slice(start, start + CHUNK_ROWS))) for start in range(0, len(marks.names), CHUNK_ROWS)),
-        strict=True,
-    )
-    return locate.located(PositionColumns.joined(columns), None if feet[0] is None else torch.cat(feet))
+    starts = range(0, len(marks.names), CHUNK_ROWS)
+    return locate.located(PositionColumns.joined([locate(marks.rows(slice(i, i + CHUNK_ROWS))) for i in starts]))
 
 
 class PointLocator:
@@ -128,11 +125,9 @@ class PointLocator:
             self.cameras = camera_views(localize)
 
     @torch.no_grad()
-    def __call__(self, marks: Marks) -> tuple[PositionColumns, Tensor | None]:
-        """The columns of some rows, and (N, 3) where their bearings and ranges count from; None: the left camera."""
-        if self.localize.weights == "marks":
-            return self._of_pairs(marks), None
-        return self._of_views(marks)
+    def __call__(self, marks: Marks) -> PositionColumns:
+        """The columns of some rows."""
+        return self._of_pairs(marks) if self.localize.weights == "marks" else self._of_views(marks)
 
     def _of_pairs(self, marks: Marks) -> PositionColumns:
         localize, count = self.localize, len(marks.names)
@@ -157,9 +152,9 @@ class PointLocator:
         baseline = float(localize.rig.baseline)
         for i in np.flatnonzero(~ok | doubtful).tolist():
             reasons[i] = _pair_reason(PositionStatus(int(found.status[i])), found, i, baseline)
-        return PositionColumns(marks.names, found.status.numpy(), reasons, numbers, dict(marks.extras))
+        return _columns(marks, found, reasons, numbers)
 
-    def _of_views(self, marks: Marks) -> tuple[PositionColumns, Tensor]:
+    def _of_views(self, marks: Marks) -> PositionColumns:
         rig, cov = self.localize.rig, None
         if marks.sigma is not None or marks.covariance is not None:
             sigma = marks.sigmas(float(self.localize.pixel_sigma))
@@ -170,11 +165,10 @@ class PointLocator:
         found = self.localize(
             marks.pixels, cov=cov, height=stated, height_sigma=1.0 if self.height is None else self.height[1]
         )
-        center = rig.center
         own = found
         if rig.origin is not None:
             own = found._replace(bearing=(own_axes(rig)[found.anchor] @ found.bearing[..., None])[..., 0])
-        extras = dict(marks.extras) | {
+        extras = {
             "cameras": [_camera_list(rig, row) for row in found.used.tolist()],
             "left_out": [_camera_list(rig, row) for row in found.bad.tolist()],
             "misfit_sigmas": [
@@ -182,9 +176,7 @@ class PointLocator:
                 for row in found.misfit.tolist()
             ],
         }
-        reasons = _view_reasons(rig, found)
-        columns = PositionColumns(marks.names, found.status.numpy(), reasons, self._numbers(own, []), extras)
-        return columns, center[found.anchor]
+        return _columns(marks, found, _view_reasons(rig, found), self._numbers(own, []), extras)
 
     def _numbers(self, found: Localization, more: Sequence[Group]) -> NDArray[np.float64]:
         ok = (found.status == int(PositionStatus.OK)).numpy()
@@ -193,11 +185,9 @@ class PointLocator:
             geoid[ok] = geoid_column(self.geoid, geodetic[ok, 0], geodetic[ok, 1])
         return number_table(found, [("geoid_height_m", ok, geoid[None]), *more], on_earth=self.localize.on_earth)
 
-    def located(self, columns: PositionColumns | None = None, feet: Tensor | None = None) -> Located:
+    def located(self, columns: PositionColumns | None = None) -> Located:
         """Positions with what they were located by: where the rig stood, and which errors are covered."""
         localize = self.localize
-        if localize.weights == "all" and feet is None:
-            feet = torch.zeros(0, 3, dtype=torch.float64)
         heading, pitch, roll = localize.attitude_deg if localize.on_earth else (math.nan,) * 3
         return Located(
             columns=columns or PositionColumns.joined([]),
@@ -209,8 +199,16 @@ class PointLocator:
             pixel_sigma=float(localize.pixel_sigma),
             included=localize.included,
             geoid=None if self.geoid is None else self.geoid.name,
-            feet=feet,
+            centers=localize.rig.center.detach().cpu() if localize.weights == "all" else None,
         )
+
+
+def _columns(
+    marks: Marks, found: Localization, reasons: list[str], numbers: NDArray[np.float64],
+    extras: dict[str, list[str]] | None = None,
+) -> PositionColumns:  # fmt: skip
+    status, anchor = found.status.numpy(), found.anchor.numpy()
+    return PositionColumns(marks.names, status, reasons, numbers, {**marks.extras, **(extras or {})}, anchor)
 
 
 def own_axes(rig: Rig) -> Tensor:
@@ -296,21 +294,17 @@ class PositionSample:
         self._named, self._most = named, most
         self._stride = 1
         self._numbers, self._kept = np.zeros(0, dtype=np.int64), PositionColumns.joined([])
-        self._feet = torch.zeros(0, 3, dtype=torch.float64)
         self.count = 0
         self._statuses = np.zeros(len(PositionStatus), dtype=np.int64)
 
-    def add(self, columns: PositionColumns, feet: Tensor | None = None) -> None:
-        """Count the next rows, and keep some, with where their bearings count from, (N, 3), of several cameras."""
+    def add(self, columns: PositionColumns) -> None:
+        """Count the next rows, and keep some."""
         numbers = np.arange(self.count, self.count + len(columns.names))
         self.count += len(numbers)
         self._statuses += np.bincount(columns.status, minlength=len(self._statuses))
         while self.count > self._stride * self._most:
             self._stride *= 2
         parts = [self._wanted(self._numbers, self._kept), self._wanted(numbers, columns._replace(extras={}))]
-        if feet is not None:
-            whole = torch.cat([self._feet, feet])
-            self._feet = whole[np.isin(np.concatenate([self._numbers, numbers]), [*parts[0][0], *parts[1][0]])]
         self._numbers = np.concatenate([which for which, _ in parts])
         self._kept = PositionColumns.joined([rows for _, rows in parts])
 
@@ -329,5 +323,5 @@ class PositionSample:
 
     def located(self, locate: PointLocator) -> Located:
         """What was kept, in the order of the table."""
-        found = locate.located(self._kept, None if locate.localize.weights == "marks" else self._feet)
+        found = locate.located(self._kept)
         return found if len(self._numbers) == self.count else dataclasses.replace(found, rows=self.count)

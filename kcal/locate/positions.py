@@ -80,7 +80,8 @@ class Located(ArrowRows):
     `columns` contains the positions as arrays, `positions` gives each row as a `Position`. `origin` is None, there are
     no cameras, and heading, pitch and roll are NaN, where the rig has no place on the Earth.
 
-    `feet` (N, 3) are the places, meters, from which bearings and ranges of the rows count; None: the left camera.
+    `centers` (V, 3) are where the cameras stand, meters, if ranges count from each of them; None: all count from the
+    left camera.
 
     `included` names the errors that intervals and covariances cover; `geoid` is the grid of the geoid heights, None
     without one. `rows` is the length of the table of which the positions are a sample, None if they are all.
@@ -99,7 +100,7 @@ class Located(ArrowRows):
     included: tuple[str, ...] = ("marks",)
     geoid: str | None = None
     rows: int | None = None
-    feet: Tensor | None = None
+    centers: Tensor | None = None
 
     @functools.cached_property
     def positions(self) -> tuple[Position, ...]:
@@ -122,7 +123,14 @@ class Located(ArrowRows):
         """Of which frame positions are the meters."""
         if self.origin is not None:
             return "east, north, up of the origin"
-        return "x right, y down, z forward of the left camera" if self.feet is None else "x, y, z of the rig"
+        return "x right, y down, z forward of the left camera" if self.centers is None else "x, y, z of the rig"
+
+    @property
+    def feet(self) -> Tensor:
+        """(N, 3) where bearings and ranges count from, meters; the left camera is at zero."""
+        if self.centers is None:
+            return torch.zeros(len(self.columns.names), 3, dtype=torch.float64)
+        return self.centers[torch.from_numpy(self.columns.anchor)]
 
     @property
     def count_note(self) -> str:
@@ -244,22 +252,22 @@ def _level_outline(place: Tensor, spread: Tensor, share: float, plain: bool = Fa
 
 def region_rings(located: Located) -> list[Ring]:
     """The ring of each position: (latitude, longitude), closed, counterclockwise, longitudes without a jump."""
-    blocks = ring_blocks(located.columns, located.place, plain=located.feet is not None)
+    blocks = ring_blocks(located.columns, located)
     return [[(lat, lon) for lat, lon in ring] for block in blocks for ring in block.tolist()]
 
 
-def ring_blocks(columns: PositionColumns, origin: Origin, *, plain: bool = False) -> Iterator[NDArray[np.float64]]:
+def ring_blocks(columns: PositionColumns, run: Located) -> Iterator[NDArray[np.float64]]:
     """The rings (M, 73, 2) of those rows that have a position, some rows at a time.
 
-    Only lines of sight from one place skew a region; `plain` ones are ellipses.
+    Only lines of sight from one place skew a region; others are ellipses.
     """
     upper = NUMBERS.index("cov_ee_m2") + np.array([[0, 1], [1, 3]])
-    rotation, translation = anchor(origin)
+    rotation, translation = anchor(run.place)
     located = torch.from_numpy(columns.numbers[columns.located])
     # Splitting no rows gives one part, of no rows.
     for part in located.split(_AT_ONCE) if len(located) else ():
         east, north, up, lon_of_point = (part[:, NUMBERS.index(name)] for name in ("east_m", "north_m", "up_m", "lon"))
-        outline = _level_outline(torch.stack([east, north], -1), part[:, upper], REGION_SHARE, plain)
+        outline = _level_outline(torch.stack([east, north], -1), part[:, upper], REGION_SHARE, run.centers is not None)
         x, y, z = (
             row[0] * outline[0] + row[1] * outline[1] + (row[2] * up[:, None] + offset)
             for row, offset in zip(rotation, translation, strict=True)
@@ -324,7 +332,7 @@ def position_table(columns: PositionColumns, run: Located) -> Any:
         return arrow_table(texts | numbers | columns.extras, {"kcal": {"frame": run.frame}})
     numbers = {name: columns.column(name) for name in NUMBERS}
     places = np.stack([numbers[name] for name in ("lon", "lat", "height_ellipsoidal_m")], -1)
-    rings = (ring[:, ::-1] for block in ring_blocks(columns, run.place, plain=run.feet is not None) for ring in block)
+    rings = (ring[:, ::-1] for block in ring_blocks(columns, run) for ring in block)
     regions = [wkb_polygon(_flat_rings(next(rings))) if there else None for there in columns.located.tolist()]
     geometries = {"geometry": wkb_points(places), "region": regions}
     about: dict[str, dict[str, Any]] = {"geo": _GEO, "kcal": {"range_interval": run.interval_note, "geoid": run.geoid}}

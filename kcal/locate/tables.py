@@ -51,6 +51,7 @@ class PositionColumns(NamedTuple):
         reasons: empty, or why there is no position, or a warning.
         numbers: (N, 24) float64, the columns `NUMBERS`; NaN where unknown, and `range_high_m` may be infinite.
         extras: the cells of further columns of the table of marks, by name.
+        anchor: (N,) number of the camera from which bearing and range count.
     """
 
     names: Sequence[str]
@@ -58,6 +59,7 @@ class PositionColumns(NamedTuple):
     reasons: Sequence[str]
     numbers: NDArray[np.float64]
     extras: dict[str, list[str]]
+    anchor: NDArray[np.int64]
 
     def column(self, name: str) -> NDArray[np.float64]:
         """(N,) one of the numbers."""
@@ -72,6 +74,7 @@ class PositionColumns(NamedTuple):
             [self.reasons[i] for i in places],
             self.numbers[which],
             {name: [cells[i] for i in places] for name, cells in self.extras.items()},
+            self.anchor[which],
         )
 
     def pieces(self, size: int) -> Iterator[PositionColumns]:
@@ -79,17 +82,18 @@ class PositionColumns(NamedTuple):
         for start in range(0, len(self.names), size):
             part = slice(start, start + size)
             extras = {name: cells[part] for name, cells in self.extras.items()}
-            yield PositionColumns(self.names[part], self.status[part], self.reasons[part], self.numbers[part], extras)
+            names, reasons = self.names[part], self.reasons[part]
+            yield PositionColumns(names, self.status[part], reasons, self.numbers[part], extras, self.anchor[part])
 
     @classmethod
     def joined(cls, parts: Sequence[PositionColumns]) -> PositionColumns:
         """The rows of some columns, one after the other, with the further columns of the first."""
         if not parts:
-            return cls((), np.zeros(0, np.int8), (), np.zeros((0, len(NUMBERS))), {})
-        names, status, reasons, numbers, extras = zip(*parts, strict=True)
+            return cls((), np.zeros(0, np.int8), (), np.zeros((0, len(NUMBERS))), {}, np.zeros(0, np.int64))
+        names, status, reasons, numbers, extras, anchor = zip(*parts, strict=True)
         return cls(
             [*itertools.chain(*names)], np.concatenate(status), [*itertools.chain(*reasons)], np.concatenate(numbers),
-            {name: [*itertools.chain(*(each[name] for each in extras))] for name in extras[0]},
+            {name: [*itertools.chain(*(each[name] for each in extras))] for name in extras[0]}, np.concatenate(anchor),
         )  # fmt: skip
 
     @property

@@ -237,7 +237,7 @@ class LiveMap:
     def __init__(self, run: Located, port: int, start: datetime.datetime | None = None) -> None:
         cameras = [
             {
-                "name": camera.name if run.feet is not None else f"{camera.name} camera",
+                "name": camera.name if run.centers is not None else f"{camera.name} camera",
                 "place": camera_place(camera, run.place),
                 "field": field_of_view(camera, run.place, _FIELD_REACH_M),
             }
@@ -351,7 +351,7 @@ def _tracks(columns: PositionColumns, run: Located) -> list[dict[str, Any]]:
     """The tracks with a position: name, place, 95 % region, and what is said of each."""
     origin = run.place
     located = np.flatnonzero(columns.located)
-    rings = itertools.chain.from_iterable(ring_blocks(columns, origin, plain=run.feet is not None))
+    rings = itertools.chain.from_iterable(ring_blocks(columns, run))
     distances = columns.column("range_m")
     # Of an interval of 95 %; one without end tells no digits.
     sigmas = (columns.column("range_high_m") - columns.column("range_low_m")) / 3.92

@@ -364,7 +364,9 @@ def track_columns(tracks: Tracks, sequence: int, stations: Rig | None = None) ->
             " ".join(name for name, one in zip(stations.names, row, strict=True) if one) for row in tracks.seen.tolist()
         ]
     names, status = [f"track {number}" for number in tracks.number], state.status.numpy()
-    return PositionColumns(names, status, [_REASONS[int(code)] for code in status], numbers, extras)
+    return PositionColumns(
+        names, status, [_REASONS[int(code)] for code in status], numbers, extras, state.anchor.numpy()
+    )
 
 
 def _texts(values: torch.Tensor, ok: torch.Tensor) -> list[str]:
@@ -576,7 +578,7 @@ class Stream:
         when = self._calendar(moment.time)
         tracks = self.tracker(moment.pairs, moment.time)
         # Files of two cameras of one mast tell all from the left one.
-        stations = None if self.run.feet is None else self.tracker.localize.rig
+        stations = None if self.run.centers is None else self.tracker.localize.rig
         columns = track_columns(tracks, sequence, stations)
         parts = [
             appended(path.suffix.lower(), self.run, columns, when, first=size == 0)

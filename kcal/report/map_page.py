@@ -287,15 +287,14 @@ def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
     sweep = torch.linspace(low, high, 90, dtype=torch.float64) + located.heading_deg
     arcs = [
         {"name": range_text(arc), "line": map_places(level_rim((0, 0, 0), sweep, arc), located.place)}
-        for arc in (arcs_within(reach) if located.feet is None else [])
+        for arc in (arcs_within(reach) if located.centers is None else [])
     ]
-    feet = torch.zeros(len(located.positions), 3, dtype=torch.float64) if located.feet is None else located.feet
     bearings = [
         map_places(
             foot + level_rim((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0) * ends,
             located.place,
         )
-        for p, foot in zip(located.positions, feet, strict=True)
+        for p, foot in zip(located.positions, located.feet, strict=True)
         if p.azimuth_deg is not None and p.status != PositionStatus.OK
         for ends in [torch.tensor([[min(p.range_low_m or 0.0, reach)], [reach]], dtype=torch.float64)]
     ]

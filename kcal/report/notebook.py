@@ -73,15 +73,13 @@ def _located(located: Located) -> str:
     count = len(located.columns.names)
     if count > _MOST:
         some = np.linspace(0, count - 1, _MOST).round().astype(int)
-        feet = None if located.feet is None else located.feet[some]
-        columns = located.columns.rows(some)
-        located = dataclasses.replace(located, columns=columns, feet=feet, rows=located.rows or count)
+        located = dataclasses.replace(located, columns=located.columns.rows(some), rows=located.rows or count)
     reasons = [f"* {position.name}: {position.reason}" for position in located.positions if position.reason]
     note = f"Interval: {located.interval_note}. Positions are {located.frame}."
     table = _html_of_blocks([located.count_note, position_rows(located), *reasons, note])
     if located.origin is None:
         return table
-    return _picture_html((positions_figure if located.feet is None else stations_figure)(located)) + table
+    return _picture_html((positions_figure if located.centers is None else stations_figure)(located)) + table
 
 
 @html_of.register

@@ -322,8 +322,7 @@ def stations_figure(located: Located, truth: Tensor | None = None, ax: Axes | No
             figures.draw_field(axes, np.concatenate([place[None], rim, place[None]]), color)
         axes.plot(*place, "^", color=color, markersize=9)
         figures.name_point(axes, place, camera.name, (6, 6), fontsize=10)
-    feet = torch.zeros(len(located.positions), 3) if located.feet is None else located.feet
-    for position, foot in zip(located.positions, feet.numpy() / 1e3, strict=True):
+    for position, foot in zip(located.positions, located.feet.numpy() / 1e3, strict=True):
         if position.enu is not None and position.covariance is not None:
             center, spread = torch.tensor(position.enu).double(), torch.tensor(position.covariance).double()
             ring = region_outline(center, spread, plain=True) / 1e3

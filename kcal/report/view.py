@@ -261,7 +261,7 @@ class _Recorded:
         first, upper = (NUMBERS.index(name) for name in ("east_m", "cov_ee_m2"))
         enu = numbers[:, first : first + 3]
         half, turn = ellipsoids(numbers[:, upper + np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])])
-        foot = 0.0 * enu if located.feet is None else located.feet.cpu().numpy()[rows]
+        foot = located.feet.numpy()[rows]
         ends = numbers[:, [NUMBERS.index("range_low_m"), NUMBERS.index("range_high_m")]]
         ends = np.where(np.isfinite(ends), ends, np.linalg.norm(enu - foot, axis=-1)[:, None])[..., None]
         sight = (enu - foot) / np.linalg.norm(enu - foot, axis=-1, keepdims=True)

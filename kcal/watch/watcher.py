@@ -262,9 +262,7 @@ _MONTH = 30 * 86400.0
 _PATIENCE = 5.0
 
 
-def located_at(
-    history: Path, rig: Rig, locator: Callable[[Rig], PointLocator]
-) -> Callable[[Marks], tuple[PositionColumns, Tensor | None]]:
+def located_at(history: Path, rig: Rig, locator: Callable[[Rig], PointLocator]) -> Callable[[Marks], PositionColumns]:
     """What locates rows with a column `time`: by the rig of that second.
 
     Args:
@@ -274,7 +272,7 @@ def located_at(
     """
     watched: Watched | None = None
 
-    def locate(marks: Marks) -> tuple[PositionColumns, Tensor | None]:
+    def locate(marks: Marks) -> PositionColumns:
         nonlocal watched
         texts = marks.extras.get("time")
         if texts is None:
@@ -293,8 +291,8 @@ def located_at(
         for time, group in itertools.groupby(range(len(times)), times.__getitem__):
             rows = list(group)
             standing = locator(watched.rig_at(float(time)))
-            parts.append(standing(marks.rows(slice(rows[0], rows[-1] + 1)))[0])
-        return PositionColumns.joined(parts), None
+            parts.append(standing(marks.rows(slice(rows[0], rows[-1] + 1))))
+        return PositionColumns.joined(parts)
 
     return locate
 

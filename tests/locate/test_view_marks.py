@@ -138,7 +138,7 @@ def test_a_long_table_is_located_as_a_short_one(
         outputs.append([cell for row in csv.reader(out[0].read_text().splitlines()) for cell in row])
         locate, sample = PointLocator(Localizer(rig, weights="all")), PositionSample(most=20)
         for views, _ in read_mark_chunks(tmp_path / "marks.csv", rig.names):
-            sample.add(*locate(views))
+            sample.add(locate(views))
         samples.append(sample.located(locate))
     for whole, part in zip(*outputs, strict=True):
         assert whole == part or float(whole) == pytest.approx(float(part), rel=1e-6, abs=1e-9)

@@ -57,7 +57,9 @@ def sent_to(broker: Broker) -> Sender:
     sender = sender_to(f"mqtt://127.0.0.1:{broker.port}/site/tracks")
     numbers = np.full((2, len(NUMBERS)), np.nan)
     numbers[:, :3] = 19.0, 72.0, 5.0
-    columns = PositionColumns(["track 1", "track 2"], np.zeros(2, np.int8), ["", ""], numbers, {"sequence": ["9", "9"]})
+    columns = PositionColumns(
+        ["track 1", "track 2"], np.zeros(2, np.int8), ["", ""], numbers, {"sequence": ["9", "9"]}, np.zeros(2, int)
+    )
     run = PointLocator(Localizer(site.rig.placed(origin=site.origin, heading_deg=0.0))).located()
     sender.send(columns, run, datetime.datetime.now(datetime.UTC))
     sender.close()
