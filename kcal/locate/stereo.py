@@ -43,8 +43,8 @@ def range_interval(inverse_range: Tensor, sigma: Tensor, known: Tensor | None = 
     Example:
         >>> f, baseline, disparity = 1600.0, 10.0, torch.tensor([3.2], dtype=torch.float64)
         >>> sigma = torch.tensor([0.5 / (f * baseline)], dtype=torch.float64)
-        >>> interval = range_interval(disparity / (f * baseline), sigma)
-        >>> round(interval.low.item(), 1), round(interval.high.item(), 1)
+        >>> low, high = range_interval(disparity / (f * baseline), sigma)
+        >>> round(low.item(), 1), round(high.item(), 1)
         (3827.8, 7207.1)
     """
     ends = []
