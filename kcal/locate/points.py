@@ -152,7 +152,7 @@ class PointLocator:
         baseline = float(localize.rig.baseline)
         for i in np.flatnonzero(~ok | doubtful).tolist():
             reasons[i] = _pair_reason(PositionStatus(int(found.status[i])), found, i, baseline)
-        return _columns(marks, found, reasons, numbers)
+        return _as_columns(marks, found, reasons, numbers)
 
     def _of_views(self, marks: Marks) -> PositionColumns:
         rig, cov = self.localize.rig, None
@@ -176,7 +176,7 @@ class PointLocator:
                 for row in found.misfit.tolist()
             ],
         }
-        return _columns(marks, found, _view_reasons(rig, found), self._numbers(own, []), extras)
+        return _as_columns(marks, found, _view_reasons(rig, found), self._numbers(own, []), extras)
 
     def _numbers(self, found: Localization, more: Sequence[Group]) -> NDArray[np.float64]:
         ok = (found.status == int(PositionStatus.OK)).numpy()
@@ -203,7 +203,7 @@ class PointLocator:
         )
 
 
-def _columns(
+def _as_columns(
     marks: Marks, found: Localization, reasons: list[str], numbers: NDArray[np.float64],
     extras: dict[str, list[str]] | None = None,
 ) -> PositionColumns:  # fmt: skip
