@@ -490,7 +490,8 @@ def reach_of(found: ViewsFit, variance: Tensor, behind: Tensor | None = None) ->
         # What the closed form put at infinity may have come back in front of the rig.
         back = usable & ~lost & ~weak
         code = flag_positions(code, back if behind is None else back & ~behind, PositionStatus.OK)
-    return Reach(value, sigma, *map(found.steady, range_interval(value, sigma, known)), code)
+    low, high = map(found.steady, range_interval(value, sigma, known))
+    return Reach(value, sigma, low, high, code)
 
 
 def errors_by_camera(rig: Rig) -> tuple[Tensor | None, Tensor | None, tuple[tuple[int, ...], ...]]:

@@ -93,9 +93,9 @@ def station_sights(
         ray[own], there[own] = rays[0] @ posed.rotation[c], valid[0]
         wide[own] = (slope * (sigma**2 + common_variance(posed, common, c, ray[own]).amax(-1))).sqrt()
     up = torch.zeros_like(posed.center) if posed.up is None else posed.up
-    numbers = (value.cpu().numpy() for value in (ray, wide, place))
-    center, up = posed.center.cpu().numpy(), up.cpu().numpy()
-    return StationSights(camera, *numbers, air, center, up, float(posed.bending)), there.cpu().numpy()
+    rays_of, wide_of, apart, center, up_of = (one.cpu().numpy() for one in (ray, wide, place, posed.center, up))
+    sights = StationSights(camera, rays_of, wide_of, apart, air, center, up_of, float(posed.bending))
+    return sights, there.cpu().numpy()
 
 
 def near_lines(localize: Localizer, anchors: Sequence[Tensor], options: AssociationOptions, nearest: float) -> Tensor:

@@ -104,7 +104,8 @@ class TestPencils:
         flat = np.linalg.norm(normal, axis=1)
         place = (camera + 0.5) / 2000.0
         wide = gate * np.hypot(sigma, place) + (2e-8 + gate * 1e-9) * FARTHEST_BEND_M
-        wide = np.minimum(wide / flat, math.pi)
+        # Within the noise of the base itself, any plane is possible.
+        wide = np.where(wide < flat, np.arcsin(np.minimum(wide / flat, 1.0)), math.pi)
         cosine = (normal[rows, None] * normal[None, others]).sum(-1)
         turned = np.cross(normal[rows, None], normal[None, others]) @ base
         angle = np.abs(np.arctan2(turned, cosine))
