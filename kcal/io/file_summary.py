@@ -86,8 +86,8 @@ def take_joint_errors(rig: Rig) -> None:
     for camera in (rig.left, rig.right):
         size = camera.params.shape[-1]
         half = rig.covariance.half[:, first : first + size]
-        known = camera.calibration or CameraCalibration()
-        camera.calibration = dataclasses.replace(known, sigma=None, information=None, covariance=half.T @ half)
+        known, matrix = camera.calibration or CameraCalibration(), half.T @ half if half.any() else None
+        camera.calibration = dataclasses.replace(known, sigma=None, information=None, covariance=matrix)
         first += size
 
 

@@ -107,7 +107,7 @@ class ZernikeProducts(NamedTuple):
     def columns(self, x: Tensor, y: Tensor, scale: Tensor | None = None, out: Tensor | None = None) -> Tensor:
         """(M, ..., 2, N) as `FieldModes.columns`, times a scale (..., 2, N), into memory if it is given."""
         profiles = (self.profiles @ self.polynomials(x.reshape(-1), y.reshape(-1))).unflatten(
-            -1, (*x.shape[:-1], 1, -1)
+            -1, (*x.shape[:-1], 1, x.shape[-1])
         )
         re, im = self.powers(x, y).movedim((-3, -2), (0, 1))
         # A mode has one of four pairs of u and v.

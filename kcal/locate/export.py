@@ -303,10 +303,6 @@ class _Format(NamedTuple):
     end: bytes = b""
 
 
-def _json_start(run: Located, columns: PositionColumns) -> bytes:
-    return b'{"type":"FeatureCollection","features":[\n' + b",\n".join(camera_features(run))
-
-
 def _after_others(features: Iterable[bytes]) -> bytes:
     return b",\n".join([b"", *features])
 
@@ -349,7 +345,7 @@ def _csv_cells(texts: Iterable[str]) -> list[str]:
 
 
 _GEOJSON = _Format(
-    _json_start,
+    lambda run, columns: b'{"type":"FeatureCollection","features":[\n' + b",\n".join(camera_features(run)),
     lambda run, columns, time: _after_others(point_features(columns)),
     lambda run, columns: _after_others(region_features(columns, run)),
     b"\n]}\n",

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from kcal.checks import StatedModule, as_points, expanded, scalar
+from kcal.checks import StatedModule, as_points, as_tensor, expanded, scalar
 from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
@@ -323,7 +323,7 @@ class Localizer(Operations, Movable, StatedModule):
         mask: Tensor | None = None,
         *,
         velocity: Tensor | None = None,
-        height: Tensor | Ground | None = None,
+        height: Tensor | ArrayLike | Ground | None = None,
         height_sigma: float = 1.0,
     ) -> Localization:
         """Locate the pixels (..., N, 2) of two cameras, `forward(left, right)`, or rows (..., V, 2) of V cameras.
@@ -376,8 +376,8 @@ class Localizer(Operations, Movable, StatedModule):
                 raise InputError("height: this rig has no place on the Earth; give its origin")
             if not 0.0 < height_sigma < math.inf:
                 raise InputError(f"height_sigma: a positive number of meters is needed, got {height_sigma}")
-            if isinstance(height, Tensor):
-                height = expanded("height", height.to(torch.float64), lead).reshape(-1)
+            if not callable(height):
+                height = expanded("height", as_tensor("height", height).to(pixels), lead).reshape(-1)
         pixels, seen = pixels.reshape(-1, count, 2), seen.reshape(-1, count)
         cov = None if cov is None else cov.reshape(-1, count, 2, 2)
         ground, heights = (None, height) if isinstance(height, Tensor) else (height, None)

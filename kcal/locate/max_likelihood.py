@@ -260,27 +260,30 @@ def _evaluate(fixed: _Fixed, theta: Tensor) -> _Evaluated:
     return _Evaluated(cost, jacobian, weighted, residual, turned, tuple(projections), slope)
 
 
-def _normal_matrix(at: _Evaluated, fixed: _Fixed) -> Six:
-    """Jᵀ W J by its six entries 11, 12, 13, 22, 23, 33; the identity where a point is not usable."""
+def _covariance_at(at: _Evaluated, fixed: _Fixed) -> Six:
+    """Of (a, b, ρ), from the noise of the pixels and a held row: entries 11, 12, 13, 22, 23, 33; zeros if singular."""
     j, w = at.jacobian.unbind(-3), at.weighted.unbind(-3)
     places = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
     entries = torch.stack([j[row] * w[column] for row, column in places], -3).sum(-2)
-    if fixed.around.held is not None:
-        held = fixed.around.held.unbind(-2)
-        entries = entries + torch.stack([held[row] * held[column] for row, column in places], -2)
     still = entries.new_tensor([[float(row == column)] for row, column in places])
-    return torch.where(fixed.usable[..., None, :], entries, still).unbind(-2)  # type: ignore[return-value]
-
-
-def _covariance_at(at: _Evaluated, fixed: _Fixed) -> Six:
-    """Of (a, b, ρ), from the noise of the pixels."""
-    # By the adjugate; zero where the determinant vanishes.
-    a, b, c, d, e, f = _normal_matrix(at, fixed)
-    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * A + b * B + c * C
-    regular = determinant > 0
+    a, b, c, d, e, f = torch.where(fixed.usable[..., None, :], entries, still).unbind(-2)
+    # ρ is eliminated first, so that a height which is known far better than pixels leaves their digits.
+    held = None if fixed.around.held is None else fixed.around.held.unbind(-2)
+    whole = f if held is None else f + held[2] * held[2]
+    whole, known = torch.where(whole > 0, whole, 1.0), whole > 0
+    A, B, D = a - c * c / whole, b - c * e / whole, d - e * e / whole
+    if held is not None:
+        p, q, r = held
+        A = A + p * (f * p - 2.0 * r * c) / whole
+        B = B + (f * p * q - r * (c * q + e * p)) / whole
+        D = D + q * (f * q - 2.0 * r * e) / whole
+        c, e = c + p * r, e + q * r
+    determinant = A * D - B * B
+    regular = known & (determinant > 0)
     scale = torch.where(regular, 1.0 / torch.where(regular, determinant, 1.0), 0.0)
-    return A * scale, B * scale, C * scale, (a * f - c * c) * scale, (b * c - a * e) * scale, (a * d - b * b) * scale
+    A, B, D, c, e = A * scale, B * scale, D * scale, c / whole, e / whole
+    by_a, by_b = B * e - D * c, B * c - A * e
+    return D, -B, by_a, A, by_b, torch.where(regular, 1.0 / whole - c * by_a - e * by_b, 0.0)
 
 
 def _product(m: Sequence[Tensor], v: Tensor) -> Tensor:
@@ -348,7 +351,7 @@ def calibration_effect(fit: PointFit, scale: Tensor, factor: Tensor) -> Tensor:
     own, other = factor.split([left.shape[-3], len(factor) - left.shape[-3]])
 
     def pixels(factor: Tensor, moved: Tensor) -> Tensor:
-        return (factor.mT @ moved.flatten(-2)).unflatten(-1, (2, -1))
+        return (factor.mT @ moved.flatten(-2)).unflatten(-1, moved.shape[-2:])
 
     moved = torch.cat([pixels(own, left), pixels(other, torch.cat([right, pose], -3))], -2)  # (..., K, 4, N)
     # One of the four pixel coordinates after the other: all at once would take four times the memory.

@@ -89,9 +89,7 @@ def _plain_list(values: Any) -> list | None:
 
 
 def _from_array(source: Any) -> Raw:
-    table = _as_numbers("boxes", source)
-    if table.numel() == 0:
-        return dict(boxes=table.reshape(0, 4))
+    table = _boxes(source)
     if table.ndim != 2 or not 4 <= table.shape[1] <= 6:
         raise InputError(
             f"detections: shape (N, 4) to (N, 6) of x1, y1, x2, y2, score, class is needed, got {tuple(table.shape)}"
@@ -322,6 +320,8 @@ class Detections:
         if masks is not None:
             masks = masks if masks.dtype == torch.bool else masks > 0.5  # torchvision's are probabilities
             masks = masks[:, 0] if masks.ndim == 4 else masks
+        if len(boxes) and bool((boxes.detach().abs() <= 1.0).all()):
+            raise InputError("boxes: all lie between 0 and 1, as shares of the image do; multiply them by its size")
         score, known = raw.get("score"), {**(raw.get("names") or {}), **(names or {})}
         categories = ["object"] * len(boxes) if raw.get("category") is None else raw["category"]
         return cls(

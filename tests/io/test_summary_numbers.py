@@ -110,3 +110,14 @@ def test_a_rig_of_which_nothing_is_known() -> None:
     take_joint_errors(made)
     assert made.left.calibration is not None
     assert made.left.calibration.sigma == {"fx": 2.0}
+
+
+def test_cameras_that_are_exact_have_no_error_bars() -> None:
+    made = rig(True)
+    assert made.covariance is not None
+    half = made.covariance.half.clone()
+    half[:, :20] = 0.0
+    made.covariance = RigCovariance(half=half)
+    for own in RigSummary.made(made, {}).cameras:
+        assert own is not None
+        assert (own.sigma_px, "±" in own.focal_length) == (None, False)

@@ -63,3 +63,11 @@ def test_half_a_mounting_is_refused() -> None:
             rig.placed(**options)
     rig.mounting = Mounting(origin=origin, heading_deg=10.0)
     assert Localizer(rig).attitude_deg == (10.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("shape", [(0, 4, 2), (4, 0, 2)])  # a batch of no images, and of images without marks
+def test_nothing_to_locate_through_the_default_lens(shape: tuple[int, ...]) -> None:
+    nothing = torch.zeros(shape, dtype=torch.float64)
+    localize = Localizer.from_file(SAMPLE)
+    for module in (localize, localize.weighing_all()):
+        assert module(nothing, nothing).enu.shape == (*shape[:-1], 3)

@@ -191,6 +191,14 @@ def test_one_camera_alone_is_as_one_of_several(count: int) -> None:
     found = Localizer(few, root=few.with_errors(attitude_deg=0.01))(pixels, seen, height=height)
     assert (found.status == OK).all()
     assert (found.enu - points).norm(dim=-1).max() < 0.1
+    exact, nearly = (
+        Localizer(few, pixel_sigma=5.0)(pixels, seen, height=height, height_sigma=sigma) for sigma in (1e-9, 1e-2)
+    )
+    assert torch.allclose(exact.range_low, nearly.range_low, rtol=1e-6)  # noise of pixels is what is left
+    assert torch.allclose(*(found.covariance[:, :2, :2] for found in (exact, nearly)), rtol=1e-5)
+    alike = [Localizer(few)(pixels, seen, height=level).enu for level in (float(height[0]), height[:1].numpy())]
+    assert torch.equal(*alike)
+    assert torch.allclose(alike[0][0], found.enu[0])
 
 
 def test_errors_of_clocks_widen_along_the_motion() -> None:

@@ -147,6 +147,7 @@ def test_selection() -> None:
         (lambda: Detections.read(torch.ones(2, 3), size=SIZE), r"shape \(N, 4\) to \(N, 6\)"),
         (lambda: Detections.read(torch.tensor([[3.0, 2, 1, 4]]), size=SIZE), "has no area"),
         (lambda: Detections.read(torch.full((1, 4), torch.nan), size=SIZE), "not finite"),
+        (lambda: Detections.read(torch.tensor([[0.3, 0.2, 0.4, 1.0]]), size=SIZE), "shares of the image"),
         (lambda: Detections.read(3.0, size=SIZE), "float is not known"),
         (lambda: Detections.read({"labels": []}, size=SIZE), "has no boxes, only labels"),
         (lambda: Detections.read("{", size=SIZE), "not a line of JSON"),
