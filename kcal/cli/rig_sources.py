@@ -529,10 +529,14 @@ def parse_baselines(text: str, names: Sequence[str] = CAMERAS) -> tuple[kcal.Bas
     return tuple(found)
 
 
+def _places_in(read: RigReading, path: Path) -> kcal.rig.Survey:
+    geoid = None if read.given.terrain and path.suffix.lower() != ".gpx" else read.given.geoid
+    return kcal.rig.import_survey(path, read.origin, sigma=read.given.survey_sigma, geoid=geoid)
+
+
 def _add_positions(read: RigReading, path: Path) -> None:
     """Places of the cameras."""
-    given = read.given
-    placed = kcal.rig.import_survey(path, read.origin, sigma=given.survey_sigma, geoid=given.geoid)
+    placed = _places_in(read, path)
     read.origin = placed.origin
     read.add("positions", rooms.camera_positions(placed, tuple(read.cameras)))
 
@@ -541,7 +545,7 @@ def _add_landmarks(read: RigReading, path: Path) -> None:
     """Surveyed places with their marks."""
     given = read.given
     assert given.marks is not None
-    survey = kcal.rig.import_survey(path, read.origin, sigma=given.survey_sigma, geoid=given.geoid)
+    survey = _places_in(read, path)
     if given.positions is not None and survey.origin != read.origin:
         raise InputError("landmarks and positions: one has latitudes, the other local meters; give a --site")
     read.origin = survey.origin

@@ -312,7 +312,7 @@ def import_survey(
 
     Raises:
         FileError: it cannot be read, or a place without name, height or accuracy; the place is named.
-        InputError: a GPX file without `geoid`.
+        InputError: a GPX file without `geoid`, or another one with it.
 
     Example:
         >>> import json, tempfile
@@ -327,6 +327,8 @@ def import_survey(
     """
     path = Path(path)
     suffix = path.suffix.lower()
+    if geoid is not None and suffix != ".gpx":
+        raise InputError(f"{path}: heights are ellipsoidal there; a geoid's height is added to those of GPX only")
     if suffix not in (".geojson", ".json", ".gpx"):
         return read_survey(path, origin)
     if suffix == ".gpx" and geoid is None:

@@ -254,6 +254,7 @@ def test_check_by_landmarks(site: Path, command: Command) -> None:
         ("--landmarks survey.csv", "--landmarks and --marks belong together"),
         ("--features far.csv --baseline 10", "write LENGTH±SIGMA in meters"),
         ("--features far.csv", "nothing tells where right stands"),
+        ("--landmarks survey.csv --marks marks.csv --geoid 60", "heights are ellipsoidal there"),
         ("--landmarks survey.csv --marks then.csv", "names must be the same in both files"),
         ("--landmarks survey.csv --marks marks.csv --board-warp", "cannot be estimated without boards"),
         ("--landmarks survey.csv --marks marks.csv --picture a.jpg", "end with .png"),

@@ -202,10 +202,13 @@ def test_three_formats_of_the_same_places(tmp_path: Path) -> None:
 def test_bad_files(tmp_path: Path, name: str, text: str, what: str) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(FileError, match=what):
-        import_survey(tmp_path / name, geoid=0.0, **({"sigma": 0.1} if name == "a.gpx" else {}))
+        import_survey(tmp_path / name, **({"sigma": 0.1, "geoid": 0.0} if name == "a.gpx" else {}))
 
 
 def test_elevations_need_a_geoid(tmp_path: Path) -> None:
     (tmp_path / "s.gpx").write_text(GPX)
     with pytest.raises(InputError, match="geoid"):
         import_survey(tmp_path / "s.gpx", sigma=0.02)
+    for name in ("s.csv", "s.geojson"):  # of ellipsoidal heights, which would stay as they are
+        with pytest.raises(InputError, match="GPX only"):
+            import_survey(tmp_path / name, geoid=60.0)
