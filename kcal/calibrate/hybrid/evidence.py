@@ -464,10 +464,17 @@ class EvidenceLoss:
 
     def value(self, v: np.ndarray) -> float:
         """The value without derivatives, far cheaper; infinite where numbers overflow."""
+        best, log_determinant = self._best_at(v)
+        return best.value + self._beside(v, log_determinant)
+
+    def step(self, v: np.ndarray) -> np.ndarray:
+        """(S,) δ of the best lens and board."""
+        return self._best_at(v)[0].step
+
+    def _best_at(self, v: np.ndarray) -> tuple[_Best, float]:
         h, ratio, log_variance = self._parts(v)
         one = self._data.integrated(ratio)
-        best = _best(one.data.tempered(self._tempering), self._families, h, log_variance)
-        return best.value + self._beside(v, one.log_determinant)
+        return _best(one.data.tempered(self._tempering), self._families, h, log_variance), one.log_determinant
 
     def __call__(self, v: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """The value, its gradient, and its Hessian; infinite beyond numbers."""
@@ -631,6 +638,23 @@ def expected_maximum(
         hyper_bounds(hyperprior, len(best.log_ratio), log_variance),
     )
     return best._replace(h=torch.from_numpy(found[:count].copy()), log_ratio=found[count:-1].copy())
+
+
+def steps_of_amplitudes(
+    data: ViewData, families: PriorFamilies, best: Amplitudes, hyperprior: Hyperprior, tempering: float = 1.0
+) -> Tensor:
+    """(H, S) by how much the best lens and board move with all hyperparameters, for arguments as of `expected_maximum`.
+
+    Each row is a principal direction of their posterior, by one standard deviation. The rows' products are what the
+    covariance at one place lacks (Kass and Steffey 1989).
+    """
+    loss, log_variance = EvidenceLoss(data, families, hyperprior, tempering), math.log(best.variance)
+    at = np.concatenate([best.h.numpy(), best.log_ratio, [log_variance]])
+    low, high = np.array(hyper_bounds(hyperprior, len(best.log_ratio), log_variance), dtype=float).T
+    values, vectors = np.linalg.eigh(_inverse(loss(at)[2]))
+    away = (np.sqrt(values) * vectors).T
+    more, less = (np.stack([loss.step(np.fmin(np.fmax(v, low), high)) for v in at + end]) for end in (away, -away))
+    return torch.from_numpy(0.5 * (more - less))
 
 
 def expected_amplitudes(

@@ -32,6 +32,7 @@ from kcal.calibrate.hybrid.fitted_views import (
     expected_estimate,
     hybrid_unknowns,
     motion_is_worth,
+    moved_by_amplitudes,
     run_rounds,
 )
 from kcal.calibrate.hybrid.measured_board import BoardPrior, MeasuredBoard, off_by
@@ -46,6 +47,7 @@ from kcal.lens.field_modes import FieldModes
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LEADING, PORT, LensModel, angle_over_radius
 from kcal.lens.projection import INTRINSICS, pupil_depth
+from kcal.lens.uncertainty import pixel_covariance
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.schur import products_of
 from kcal.texts import brief
@@ -381,7 +383,7 @@ class HybridFit:
         half: (S, S); halfᵀ half is the covariance of parameters and board.
         information: the same before anything was inverted, with data and priors apart.
         sigma: px, of a corner of weight one, tempering included.
-        wider: by which variances are larger than the posterior's, where few views moved (`widening`); else 1.
+        wider: by which variances are larger than the posterior's, where views are few or few moved; else 1.
         tempering: dispersion factor that divides the weight of all data: residuals within a view are correlated.
         hyperparameters: (H,) of largest evidence.
         expected: (H,) the same with the mean squares of amplitudes, which set the priors.
@@ -536,6 +538,14 @@ class HybridFit:
         return unknowns.by_parameter(self.half.T @ self.half, len(self.state.parameters))
 
 
+def _by_amplitudes(half: Tensor, moved: Tensor, camera: Camera, square: bool) -> float:
+    """How many times larger variances in the image are if the best lens moves by rows (H, S), too."""
+    unknowns, places = hybrid_unknowns(camera.model, square), camera.grid(9, 7).reshape(-1, 2)
+    by_each = (unknowns.by_parameter(rows.T @ rows, len(camera.params)) for rows in (half, moved))
+    own, more = (pixel_covariance(camera, places, one).diagonal(dim1=1, dim2=2).nansum() for one in by_each)
+    return 1.0 + float(more / own)
+
+
 def fit_hybrid(
     points: Tensor,
     pixels: Tensor,
@@ -607,8 +617,11 @@ def fit_hybrid(
     errors = problem.pixel_errors(state)
     if not robust:
         check_shown(errors)
-    wider = 1.0 if capture.readout is None or capture.hyperprior.by_hand else widening(len(pixels))
-    half = math.sqrt(wider) * inverse * deviation
+    half, wider = inverse * deviation, 1.0 if capture.readout is None else widening(len(pixels))
+    if capture.hyperprior.by_hand:
+        camera = Camera(state.parameters, size=size, model=model)
+        wider = 1.0 if robust else _by_amplitudes(half, moved_by_amplitudes(rounds), camera, capture.square)
+    half = math.sqrt(wider) * half
     information = information_of(problem, state, math.sqrt(wider * variance), reduced)
     if known is not None:
         mean, root = known.whole.mean_and_half()

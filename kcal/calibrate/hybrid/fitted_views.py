@@ -24,6 +24,7 @@ from kcal.calibrate.hybrid.evidence import (
     maximize_evidence,
     overdispersion,
     relative_bends,
+    steps_of_amplitudes,
     view_data,
     with_tempering,
 )
@@ -546,11 +547,19 @@ def run_rounds(
 
 def expected_estimate(rounds: Rounds) -> Estimate:
     """The estimate with expected amplitudes (`expected_maximum`) in place of the most likely ones."""
+    return rounds.estimate._replace(amplitudes=expected_maximum(*_at_maximum(rounds)))
+
+
+def moved_by_amplitudes(rounds: Rounds) -> Tensor:
+    """(H, S) by how much lens and board move with amplitudes that are known only roughly (`steps_of_amplitudes`)."""
+    return steps_of_amplitudes(*_at_maximum(rounds))
+
+
+def _at_maximum(rounds: Rounds) -> tuple[ViewData, PriorFamilies, Amplitudes, Hyperprior, float]:
     estimate, data = rounds.estimate, rounds.data
     # Views that move were tempered after their amplitudes were found.
     tempering = 1.0 if data.moving else estimate.tempering
-    found = expected_maximum(data, estimate.families, estimate.amplitudes, rounds.capture.hyperprior, tempering)
-    return estimate._replace(amplitudes=found)
+    return data, estimate.families, estimate.amplitudes, rounds.capture.hyperprior, tempering
 
 
 def motion_is_worth(rounds: Rounds, readout: Readout) -> bool:

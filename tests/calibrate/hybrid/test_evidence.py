@@ -21,6 +21,7 @@ from kcal.calibrate.hybrid.evidence import (
     hyper_bounds,
     maximize_evidence,
     relative_bends,
+    steps_of_amplitudes,
     view_data,
 )
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
@@ -189,6 +190,21 @@ def test_maximum_is_found_from_afar(noise: float) -> None:
     assert value == best.loss
     assert float(np.abs(slope[inside]).max()) < 1e-3
     assert float(np.linalg.eigvalsh(bend[np.ix_(inside, inside)]).min()) > 0.0
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_lens_and_board_move_with_amplitudes(monkeypatch: pytest.MonkeyPatch, moving: bool) -> None:
+    """By the slopes of the best ones, where the posterior is so narrow that nothing else counts."""
+    at, loss = vector(moving).copy(), EvidenceLoss(data(moving), FAMILIES, PRIOR, 1.0)
+    ratios = at[len(PRIOR.mean) : -1]
+    ratios -= 4.0  # within their bounds
+    best = Amplitudes(torch.from_numpy(at[: len(PRIOR.mean)]), math.exp(at[-1]), ratios)
+    bend = loss(at)[2]
+    covariance = np.linalg.inv(bend @ bend)
+    monkeypatch.setattr("kcal.calibrate.hybrid.evidence._inverse", lambda _: 1e-8 * covariance)
+    slopes = np.array([(loss.step(at + one) - loss.step(at - one)) / 2e-5 for one in 1e-5 * np.eye(len(at))])
+    found = steps_of_amplitudes(data(moving), FAMILIES, best, PRIOR).numpy()
+    np.testing.assert_allclose(1e8 * found.T @ found, slopes.T @ covariance @ slopes, rtol=1e-4, atol=1e-12)
 
 
 def test_worth_of_motions() -> None:

@@ -314,10 +314,10 @@ def test_motion_is_looked_for_again_where_the_aspect_may_have_hidden_it(monkeypa
 
 @pytest.mark.parametrize(("views", "kept"), [(5, True), (6, False)])
 def test_few_views_do_not_tell_that_they_stood_still(views: int, kept: bool) -> None:
-    """They keep the motion of a hand, which six views that stood still lose; error bars are those of the posterior."""
+    """They keep the motion of a hand, which six views that stood still lose, and error bars for what is open of it."""
     options = FitOptions(modes=MODES, board="exact", square=True)
     fit = fit_hybrid(BOARD.points, shots(views), SIZE, options=options)
-    assert (fit.motion_sigma is not None, fit.wider) == (kept, 1.0)
+    assert (fit.motion_sigma is not None, fit.wider > 1.01) == (kept, kept)
     if fit.motion_sigma is not None:
         assert abs(math.log(fit.motion_sigma.turn / HAND[0])) < 3.0 * HAND_SPREAD
 
