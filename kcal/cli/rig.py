@@ -378,6 +378,7 @@ def rig_solve_command(
     intrinsics: Rare[Literal["prior", "fixed", "free"]] = "prior",
     keep_all: Rare[bool] = False,
     board_warp: Rare[bool] = False,
+    lens_change: Rare[kinds.Pixels] = 0.0,
     picture: Rare[kinds.Picture | None] = None,
 ) -> None:
     """Solve a rig: where the right camera stands from the left, and where both, or any number, stand on the Earth.
@@ -428,6 +429,7 @@ def rig_solve_command(
             them free.
         keep_all: Leave nothing out; only warn.
         board_warp: Also estimate how the board bends.
+        lens_change: By how much each lens changed since its calibration, at the image's corner (temperature, focus).
         picture: a plan, and residuals.
     """
     pixel_sigma_and_source(sources.pixel_sigma)
@@ -435,7 +437,7 @@ def rig_solve_command(
         raise typer.BadParameter("give boards (--pairs), landmarks (--landmarks and --marks) or features (--features)")
     options = kcal.RigOptions(
         intrinsics=intrinsics, board_warp=board_warp, reject=not keep_all, refraction=sources.refraction.value,
-        refraction_sigma=sources.refraction_sigma,
+        refraction_sigma=sources.refraction_sigma, lens_change=lens_change,
     )  # fmt: skip
     paths = [left, right, *(others or [])]
     solve_and_write(paths, sources, options, output, needs=require or (), report=report, picture=picture)

@@ -166,6 +166,18 @@ class CameraInformation:
         rows = data.placed(self.data.slots, self.estimate).rows
         return dataclasses.replace(self, rows=rows[:, :-1], residuals=rows[:, -1])
 
+    def changed(self, by: Tensor) -> CameraInformation:
+        """What is known once the camera has changed by standard normal amounts times columns (5 + P, K)."""
+        count, amounts = self.lens_size, numbered("change", by.shape[1])
+        lens = torch.linalg.pinv(self.selection()[:, :count]) @ by
+        step = torch.cat([torch.eye(count, dtype=by.dtype), -lens], 1)
+        before = (self.data + self.lens_prior).replaced(self.lens, self.estimate[:count], step, (*self.lens, *amounts))
+        zero = by.new_zeros(len(amounts))
+        both = before + Gaussian.independent(amounts, zero, zero + 1.0)
+        rows = both.marginal((*self.lens, *self.board)).rows
+        sigma = torch.where(torch.arange(len(self.sigma)) < count, math.inf, self.sigma)
+        return dataclasses.replace(self, rows=rows[:, :-1], residuals=rows[:, -1], sigma=sigma)
+
     def half(self) -> Tensor:
         """(U, U): halfᵀ half is the covariance of the unknowns; what nothing determines has a very large one."""
         return self._half

@@ -189,6 +189,26 @@ def pixel_slopes(camera: Camera, places: Tensor, at: float, wanted: list[int]) -
 _HELD_PX = 1e-4
 # Pixels in proportion to which limits of parameters count where a lens is fitted to another, as in `refit_camera`.
 FIT_PX = 0.01
+
+
+@torch.no_grad()
+def lens_changes(camera: Camera, size: float) -> Tensor:
+    """(5 + P, 2) changes of a camera's parameters that scale its image and bend it as r³, as closely as its model can.
+
+    Each by so many pixels at the image's corner.
+
+    Example:
+        >>> camera = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
+        >>> lens_changes(camera, 0.1)[:2, 0]  # 0.1 of 400 px
+        tensor([0.2000, 0.2000], dtype=torch.float64)
+    """
+    places = camera.grid(25, 17).reshape(-1, 2)
+    by_camera, _, good = pixel_slopes(camera, places, math.inf, [*range(camera.params.shape[-1])])
+    away = (places + 0.5 - 0.5 * places.new_tensor(camera.size)) / (0.5 * math.hypot(*camera.size))
+    fields = size * torch.stack([away, away * away.square().sum(-1, keepdim=True)], -1)
+    return torch.linalg.lstsq(by_camera[good].flatten(0, 1), fields[good].flatten(0, 1), driver="gelsd").solution
+
+
 # Pixels a unit that no parameter is as weak as.
 _ROUNDING = 1e-12
 

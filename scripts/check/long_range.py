@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kcal import Camera, Observations, Rig, calibrate_camera, solve_rig
+from kcal import Camera, Observations, Rig, RigOptions, calibrate_camera, solve_rig
 from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.rig.marks import Features
 from kcal.calibrate.rig.result import RigResult
@@ -53,11 +53,12 @@ def lens(observations: Observations, name: str, model: str | None = None) -> Cam
     return load_camera(path)
 
 
-def solved(features: Features, camera: Camera, sigma: float) -> RigResult:
-    """By kcal, with so many pixels of noise stated."""
+def solved(features: Features, camera: Camera, sigma: float, change: float = 0.0) -> RigResult:
+    """By kcal, with so many pixels of noise stated, and of change of the lens since its calibration."""
     tape = Baseline(first=0, second=1, length=LENGTH, sigma=TAPE)
     some = dataclasses.replace(features, pixel_sigma=sigma)
-    return solve_rig(RigData(cameras=(camera,) * 2, names=("left", "right"), features=some, baselines=(tape,)))
+    data = RigData(cameras=(camera,) * 2, names=("left", "right"), features=some, baselines=(tape,))
+    return solve_rig(data, RigOptions(lens_change=change))
 
 
 def turned(rotation: Tensor, reference: Tensor) -> list[float]:
@@ -290,6 +291,18 @@ def lenses(lenses: tuple[str, ...] = ("all views", "first half", "second half", 
         rms = "" if record is None else f"{record.rms:.2f}"
         rows.append([name, rms, f"{fitted(own, every[~out]).sigma:.3f}", *(f"{value:+z.4f}°" for value in turn)])
     return table(["lens from", "RMS of corners, px", "matches off, px", "pitch", "yaw", "roll"], rows)
+
+
+@section("long-range.md", "change")
+def changes(sizes: tuple[float, ...] = (0.0, 1.0, 3.0, 10.0)) -> Iterator[str]:
+    _, features, results = scene()
+    first, rows = results[0.15].stereo(), []
+    for size in sizes:
+        found = solved(features, lens(scene()[0], "all views"), 0.15, size)
+        yaw = turned(found.stereo().right_from_left_rotation, first.right_from_left_rotation)[1]
+        share = 100.0 * size / (0.5 * math.hypot(*first.left.size))
+        rows.append([f"{size:g} px", f"{share:.3f} %", f"{yaw:+z.4f} ± {DEGREE * float(found.sigma_rotation[1]):.4f}°"])
+    return table(["change of the lens, at the corner", "of the distance from the middle", "yaw"], rows)
 
 
 @section("long-range.md", "causes")

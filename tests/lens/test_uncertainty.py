@@ -177,6 +177,18 @@ def test_from_covariance_and_back() -> None:
     torch.testing.assert_close(found.covariance(), matrix, rtol=1e-11, atol=1e-13)
 
 
+def test_a_camera_that_changed_is_known_less() -> None:
+    """The change adds to the covariance; what is known of the board stays, and the board is unknown as before."""
+    known, by = information(), torch.tensor([[0.3, 0.0], [0.3, 0.0], [0.0, 0.2], [0.0, 0.0], [0.0, 0.0], [0.1, 0.1]])
+    by = torch.nn.functional.pad(by, (0, 0, 0, len(known.slots) - len(by))).double()
+    by[[index for index, slot in enumerate(known.slots) if slot < 0]] = 0.0
+    found = known.changed(by)
+    torch.testing.assert_close(found.covariance(), known.covariance() + by @ by.T, rtol=1e-9, atol=1e-12)
+    board = slice(known.lens_size, None)
+    ours, theirs = ((one.half().T @ one.half())[board, board] for one in (found, known))
+    torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-12)
+
+
 def test_refused() -> None:
     """Shapes and values that cannot be."""
     known = information()

@@ -38,6 +38,7 @@ from kcal.gaussian import triangular
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, check_refraction
+from kcal.lens.uncertainty import lens_changes
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief
 from kcal.threads import in_one_thread
@@ -203,6 +204,9 @@ class RigOptions:
         refraction: of light towards landmarks, as a share of the Earth's curvature; estimated from here. For
             simulations and other straight lines it and its sigma are 0.
         refraction_sigma: its standard deviation beforehand; 0 holds it.
+        lens_change: pixels at the image's corner by which scale and r³ of each lens changed since its calibration
+            (standard deviation of each): by temperature, focus, transport. What the rig's data say of it counts.
+            (A shift of the image is a turn of the camera.)
         solver: options of the Levenberg-Marquardt solver; residuals are in sigmas.
     """
 
@@ -215,12 +219,18 @@ class RigOptions:
     reject: bool = True
     refraction: float = REFRACTION
     refraction_sigma: float = REFRACTION_SIGMA
+    lens_change: float = 0.0
     solver: LMOptions = dataclasses.field(default_factory=lambda: LMOptions(residual_floor=1e-8))
 
     def __post_init__(self) -> None:
         if self.intrinsics not in ("fixed", "prior", "free"):
             raise InputError(f"intrinsics must be fixed, prior or free, got {self.intrinsics!r}")
         check_refraction(self.refraction, self.refraction_sigma)
+        if not 0 <= self.lens_change < math.inf or (self.lens_change and self.intrinsics != "prior"):
+            raise InputError(
+                f"lens_change must be a size in pixels, for intrinsics 'prior', got {self.lens_change} for "
+                f"{self.intrinsics!r}"
+            )
 
 
 @in_one_thread
@@ -332,6 +342,10 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
             own = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
             if own is not None and boards is not None:
                 own = without_repeated(own, camera, boards, at, options.solver)
+            if options.lens_change:
+                change = lens_changes(camera, options.lens_change)
+                exact = CameraInformation.from_covariance(camera.params.detach(), change @ change.T)
+                own = exact if own is None else own.changed(change)
             known.append(own)
         if boards is None:
             unknowns = _lens_unknowns(cameras, tuple(camera.fingerprint for camera in cameras), tuple(known))
