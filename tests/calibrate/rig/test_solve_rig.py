@@ -617,6 +617,22 @@ class TestInput:
         assert bool((pose_error(found).abs() < 4.5 * found.relative_covariance().diagonal().sqrt()).all())
 
 
+def test_a_lens_that_changed_since_its_calibration() -> None:
+    """Of stated size, it is found from the rig's own data, with a sigma; else an exact lens is believed."""
+    off_by, sources = [], {"landmarks": landmarks(noise=0.05, survey=0.01), "features": features(noise=0.05)}
+    changed = tuple(Camera(c.params * c.params.new_tensor([1.0 + 5e-4] * 2 + [1.0] * (len(c.params) - 2)),
+                           size=c.size, model=c.model) for c in CAMERAS[:2])  # fmt: skip
+    for size in (0.0, 0.5):
+        given = dataclasses.replace(data(**sources), cameras=changed)
+        found = solve_rig(given, dataclasses.replace(STRAIGHT, lens_change=size, reject=False)).stereo()
+        off_by.append(abs(float(found.left.focal[0] / CAMERAS[0].focal[0]) - 1.0))
+    assert off_by[0] == pytest.approx(5e-4)
+    assert off_by[1] < 2e-4
+    for wrong in ({"lens_change": -0.1}, {"lens_change": math.nan}, {"lens_change": 0.1, "intrinsics": "fixed"}):
+        with pytest.raises(InputError, match="lens_change"):
+            RigOptions(**wrong)  # type: ignore[arg-type]
+
+
 def _without(pixels: Tensor, index: int) -> Tensor:
     pixels = pixels.clone()
     pixels[index] = torch.nan
