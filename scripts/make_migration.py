@@ -39,7 +39,8 @@ OPTIONS = {
 NAMES = {
     "StereoRig": "`kcal.Rig.pair`", "rig.CameraRig": "`kcal.Rig`", "StereoLocalizer": "`kcal.Localizer`",
     "locate.MultiViewLocalizer": "`kcal.Localizer`", "locate.ViewsLocalization": "result of `kcal.Localizer`",
-    "locate.Triangulate": "`kcal.Localizer`", "locate.TriangulateViews": "`kcal.Localizer`",
+    "locate.Triangulate": "`kcal.Localizer`; of rays `kcal.locate.triangulate`",
+    "locate.TriangulateViews": "`kcal.Localizer`",
     "locate.Triangulation": "result of `kcal.Localizer`", "locate.ViewsResult": "result of `kcal.Localizer`",
     "locate.ViewMarks": "`kcal.locate.Marks`", "locate.read_views": "`kcal.locate.read_marks`",
     "locate.GroundPlaces": "result of `kcal.locate_points`",

@@ -53,7 +53,7 @@ PUBLIC = {
     """,
     "kcal.locate": """
         BudgetErrors DisparityRanges Marks Site area_of check_ranges enu_from_cam enu_to_geodetic find_geoid
-        geodetic_to_enu level_ground range_errors rank_sites read_marks terrain
+        geodetic_to_enu level_ground range_errors rank_sites read_marks terrain triangulate
         write_positions
     """,
     "kcal.track": """

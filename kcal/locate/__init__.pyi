@@ -6,6 +6,9 @@ from kcal.locate.marks import read_marks as read_marks
 from kcal.locate.marks import Marks as Marks
 from kcal.locate.export import write_positions as write_positions
 
+# Triangulation of rays
+from kcal.locate.angular import triangulate as triangulate
+
 # Ranges from disparities
 from kcal.locate.disparity import DisparityRanges as DisparityRanges
 
