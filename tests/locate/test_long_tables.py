@@ -64,7 +64,7 @@ def written(suffix: str, path: Path, at_once: int, piece: int = 10_000) -> bytes
     # The moment of Cursor-on-Target.
     writer._time = writer._time.replace(year=2026, month=5, day=4, hour=12, minute=0, second=0, microsecond=0)
     for chunk, _ in read_mark_chunks(path, at_once=at_once):
-        for columns in locate(chunk)[0].pieces(piece):
+        for columns in locate(chunk).pieces(piece):
             writer.add(columns)
     writer.close()
     return file.getvalue()
@@ -95,7 +95,7 @@ def test_a_streamed_table_is_that_of_one_call_to_the_last_bit(tmp_path: Path, mo
 
 def test_numbers_are_those_of_the_localizer_to_the_last_bit() -> None:
     locate, both = locator_of_everything(), pixels()
-    columns, _ = locate(Marks([str(i) for i in range(ROWS)], both))
+    columns = locate(Marks([str(i) for i in range(ROWS)], both))
     found = locate.localize(both[:, 0], both[:, 1])
     slopes = locate.localize.sensitivity(both[:, 0], both[:, 1])
     assert np.array_equal(columns.status, found.status.numpy())
@@ -120,7 +120,7 @@ def test_numbers_are_those_of_the_localizer_to_the_last_bit() -> None:
 
 
 def test_positions_and_columns_are_the_same() -> None:
-    columns = locator_of_everything()(Marks([str(i) for i in range(ROWS)], pixels()))[0]
+    columns = locator_of_everything()(Marks([str(i) for i in range(ROWS)], pixels()))
     located = locator_of_everything().located(columns)
     fields = {
         "lat": "lat", "lon": "lon", "height": "height_ellipsoidal_m", "geoid_height": "geoid_height_m",
@@ -297,7 +297,7 @@ def test_number_lines_keep_every_digit() -> None:
 def test_a_sample_is_even_and_does_not_depend_on_chunks() -> None:
     def sampled(size: int) -> PositionSample:
         sample = PositionSample(frozenset({"7", "247"}), most=20)
-        columns = locator_of_everything()(Marks([str(i) for i in range(ROWS)], pixels()))[0]
+        columns = locator_of_everything()(Marks([str(i) for i in range(ROWS)], pixels()))
         for piece in columns.pieces(size):
             sample.add(piece)
         return sample

@@ -626,7 +626,7 @@ def fit_hybrid(
     if known is not None:
         mean, root = known.whole.mean_and_half()
         state = state._replace(board=mean + state.board @ root)
-        information = known.in_modes(information, state.board)
+        information = known.in_modes(information, state.board, wider)
         half = torch.cat([half[:, : -len(mean)], half[:, -len(mean) :] @ root], 1)
     fit = HybridFit(
         model=model,

@@ -76,12 +76,13 @@ class BoardPrior(NamedTuple):
         mean, half = self.whole.mean_and_half()
         return torch.linalg.solve_triangular(half, (amplitudes - mean)[None], upper=False, left=False)[0]
 
-    def in_modes(self, known: CameraInformation, amplitudes: Tensor) -> CameraInformation:
+    def in_modes(self, known: CameraInformation, amplitudes: Tensor, wider: float) -> CameraInformation:
         """Convert what is known from the variables of `applied` to the board's own modes, with what others told apart.
 
         Args:
             known: with these variables as the board's unknowns.
             amplitudes: (B,) of the modes at the estimate.
+            wider: by which variances of `known` are larger than the posterior's.
         """
         if self.told is None:
             # Modes of a board that was measured are not its own: what is said of the camera, whatever the board is.
@@ -94,8 +95,8 @@ class BoardPrior(NamedTuple):
             estimate=torch.cat([known.estimate[:lens], amplitudes]),
             rows=torch.cat([known.rows[:, :lens], by_modes], 1),
             mean=torch.cat([known.mean[:lens], mean]),
-            sigma=torch.cat([known.sigma[:lens], half.diagonal()]),
-            others=self.told.placed(known.board, amplitudes).rows,
+            sigma=torch.cat([known.sigma[:lens], half.diagonal() * math.sqrt(wider)]),
+            others=self.told.placed(known.board, amplitudes).rows / math.sqrt(wider),
         )
 
 
