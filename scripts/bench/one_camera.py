@@ -1,8 +1,8 @@
 """The hybrid camera, fitted by evidence, on real captures: views that were held out, beside parametric models.
 
 The wide lens in blocks or every other view, or all but 8 of its views in three draws; OpenCV's images with one view
-left out, and their pairs, 9 fitted and 4 held out. mrcal's spline, of the wide lens, where KCAL_MRCAL names an
-interpreter that has mrcal; elsewhere its cells stay as the page has them.
+left out, and their pairs, 9 fitted and 4 held out. mrcal and lensboy, of the wide lens, where KCAL_MRCAL and
+KCAL_LENSBOY name interpreters that have them; elsewhere their cells stay as the page has them.
 
 On each held-out view only its pose is solved again; camera and board stay as fitted. Measure: sqrt(sum w² |r|² / count)
 over all folds, with the weights of the file (OpenCV's images: all one). Epipolar error:
@@ -15,6 +15,7 @@ import functools
 import math
 import os
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,6 +32,10 @@ from scripts.shared.wide_lens import folds, load, over_parts, warped
 
 # The spline of mrcal that predicts held-out views of the wide lens best, and about its focal length, pixels.
 SPLINE, FOCAL = "SPLINED11x8", 1900.0
+# Other programs' lenses, by program.
+PEERS = {
+    f"{peer}, {lens}": (peer, lens) for peer, lens in (("mrcal", SPLINE), ("lensboy", "OPENCV14"), ("lensboy", SPLINE))
+}
 SPLITS = {"blocks20": "whole blocks of views", "evenodd": "every other view"}
 # A camera and the corners of its board (N, 3), from views and their weights (V, N).
 Fitter = Callable[[Observations, Tensor], tuple[Camera, Tensor]]
@@ -62,19 +67,18 @@ MODELS: dict[str, Fitter] = {
 }
 
 
-def with_mrcal(seen: Observations, weight: Tensor, parts: list[np.ndarray]) -> str:
-    """Mrcal's splined lens with a warped board."""
+def with_peer(peer: str, lens: str, seen: Observations, weight: Tensor, parts: list[np.ndarray]) -> str:
+    """A lens of another program, with a warped board."""
     corners, weights = seen.pixels().numpy(), weight.numpy()
-    found = [
-        splined(SPLINE, corners, weights, out, size=seen.image_size, board=seen.board, focal=FOCAL) for out in parts
-    ]
+    about: Any = {"size": seen.image_size, "board": seen.board, "focal": FOCAL}
+    found = [splined(lens, corners, weights, out, **about, peer=peer) for out in parts]
     total, seconds, count = (sum(one[key] for one in found) for key in ("sum", "cpu_s", "count"))
     return f"{math.sqrt(total / count):.4f} ({seconds / len(parts):.1f} s)"
 
 
 def measure(name: str, seen: Observations, weight: Tensor, parts: list[np.ndarray]) -> str:
-    if name == "mrcal":
-        return with_mrcal(seen, weight, parts)
+    if name in PEERS:
+        return with_peer(*PEERS[name], seen, weight, parts)
     error, seconds = over_parts(MODELS[name], seen, weight, parts)
     return f"{error:.4f} ({seconds:.1f} s)"
 
@@ -112,7 +116,7 @@ def measure_epipolar(name: str, sides: list[Observations]) -> float:
 
 
 def cases(few: int) -> Iterator[tuple[str, Callable[[str], str], bool]]:
-    """What is held out, the cell of a model, and whether mrcal can do it."""
+    """What is held out, the cell of a model, and whether other programs can do it."""
     seen, weights = load()
     weight, count = torch.from_numpy(weights), len(seen.views)
     draws = [np.random.default_rng(seed).permutation(count)[few:] for seed in (100, 101, 102)]
@@ -133,13 +137,13 @@ def cases(few: int) -> Iterator[tuple[str, Callable[[str], str], bool]]:
 @section("one-camera.md", "held-out", models=("opencv5",), only="left, each view")
 def held_out_views(models: tuple[str, ...] = tuple(MODELS), views: int = 8, only: str = "") -> Iterator[str]:
     """With so many views of the wide lens fitted in one of its rows; only rows whose name contains this."""
-    chosen = {*models, *(["mrcal"] if "KCAL_MRCAL" in os.environ else [])}
+    peers = [name for name, (peer, _) in PEERS.items() if f"KCAL_{peer.upper()}" in os.environ]
     rows = (
         [
             what,
-            *(cell(model) if model in chosen and (able or model != "mrcal") else None for model in [*MODELS, "mrcal"]),
+            *(cell(name) if name in (*models, *(peers if able else ())) else None for name in (*MODELS, *PEERS)),
         ]
         for what, cell, able in cases(views)
         if only in what
     )
-    return merged("one-camera.md", "held-out", ["held out", *MODELS, f"mrcal, {SPLINE}"], rows)
+    return merged("one-camera.md", "held-out", ["held out", *MODELS, *PEERS], rows)

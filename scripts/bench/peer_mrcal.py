@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from importlib.metadata import version
 from typing import Any
 
 import mrcal  # type: ignore[import-not-found, unused-ignore]
@@ -28,6 +29,17 @@ def arrays(corners: Any, weight: Any, shape: tuple[int, int]) -> tuple[Any, Any]
     index = np.zeros((len(corners), 3), np.int32)
     index[:, 0], index[:, 2] = np.arange(len(corners)), -1
     return seen, index
+
+
+def problem(intrinsics: Any, extrinsics: Any, frames: Any, seen: Any, index: Any) -> dict[str, Any]:
+    """What `mrcal.optimize` starts from, by its names of poses in 2.5, or else those before."""
+    new = "rt_ref_frame" in mrcal.optimize.__doc__
+    return {
+        "intrinsics": intrinsics, "rt_cam_ref" if new else "extrinsics_rt_fromref": extrinsics,
+        "rt_ref_frame" if new else "frames_rt_toref": frames, "points": None, "observations_board": seen,
+        "indices_frame_camintrinsics_camextrinsics": index, "observations_point": None,
+        "indices_point_camintrinsics_camextrinsics": None,
+    }  # fmt: skip
 
 
 def main() -> None:
@@ -51,7 +63,7 @@ def main() -> None:
     )
     for free in (False,) if len(sys.argv) > 3 else (False, True):
         mrcal.optimize(
-            intrinsics, extrinsics, frames, None, seen, index, None, None, "LENSMODEL_STEREOGRAPHIC",
+            **problem(intrinsics, extrinsics, frames, seen, index), lensmodel="LENSMODEL_STEREOGRAPHIC",
             do_optimize_intrinsics_core=free, do_optimize_intrinsics_distortions=False,
             do_optimize_calobject_warp=False, do_apply_regularization=False, **common,
         )  # fmt: skip
@@ -60,9 +72,7 @@ def main() -> None:
 
     def optimize(frames: Any, seen: Any, index: Any, what: dict[str, bool]) -> None:
         mrcal.optimize(
-            intrinsics=intrinsics, extrinsics_rt_fromref=None, frames_rt_toref=frames, points=None,
-            observations_board=seen, indices_frame_camintrinsics_camextrinsics=index, observations_point=None,
-            indices_point_camintrinsics_camextrinsics=None, lensmodel=lens, do_optimize_intrinsics_core=False,
+            **problem(intrinsics, None, frames, seen, index), lensmodel=lens, do_optimize_intrinsics_core=False,
             **what, **common,
         )  # fmt: skip
 
@@ -71,6 +81,7 @@ def main() -> None:
     optimize(frames, seen, index, {"do_optimize_calobject_warp": True, "do_apply_regularization": True})
     out: dict[str, Any] = {"cpu_s": time.process_time() - cpu}
     out |= {
+        "version": version("mrcal"),
         "lens": lens,
         "intrinsics": intrinsics[0].tolist(),
         "knots": mrcal.knots_for_splined_models(lens)[0].tolist(),

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import mrcal  # type: ignore[import-not-found, unused-ignore]
 import numpy as np
+from peer_mrcal import problem  # type: ignore[import-not-found, unused-ignore]
 
 _LENS = "LENSMODEL_OPENCV8"
 
@@ -41,7 +42,7 @@ def main() -> None:
     )  # fmt: skip
     for free in (False, True):
         mrcal.optimize(
-            intrinsics, extrinsics, frames, None, seen, index, None, None, "LENSMODEL_STEREOGRAPHIC",
+            **problem(intrinsics, extrinsics, frames, seen, index), lensmodel="LENSMODEL_STEREOGRAPHIC",
             do_optimize_intrinsics_core=free, do_optimize_intrinsics_distortions=False,
             do_optimize_calobject_warp=False, do_apply_regularization=False, **common,
         )  # fmt: skip
@@ -49,7 +50,7 @@ def main() -> None:
     intrinsics, warp = np.concatenate([intrinsics, small], 1), np.zeros(2)
     for warped in (False, True):
         mrcal.optimize(
-            intrinsics, extrinsics, frames, None, seen, index, None, None, _LENS,
+            **problem(intrinsics, extrinsics, frames, seen, index), lensmodel=_LENS,
             calobject_warp=warp if warped else None, do_optimize_intrinsics_core=True,
             do_optimize_intrinsics_distortions=True, do_optimize_calobject_warp=warped, do_apply_regularization=True,
             **common,

@@ -1,6 +1,7 @@
 """Time and accuracy of calibration against other solvers on simulated views.
 
 KCAL_PEERS names an interpreter that has pyceres, KCAL_MRCAL one that has mrcal and cv2; else these are left out.
+KCAL_OPENCV names one with another OpenCV than this one's.
 Every solver runs in its own process, warmed up on a few views, and measures the processor time of the calibration
 alone. kcal and OpenCV calibrate from nothing; Ceres and mrcal start from `cv2.initCameraMatrix2D` and the true tilts,
 without which they keep flipped boards. The runs of all solvers alternate. RMS is recomputed from each solution alike. A
@@ -97,6 +98,8 @@ def with_mrcal(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...
     import cv2
     import mrcal
 
+    from scripts.bench.peer_mrcal import problem
+
     count = len(data["pixels"])
     pinhole, poses = good_start(data)
     lens = np.random.default_rng(0).uniform(-1e-6, 1e-6, coefficients)
@@ -107,14 +110,7 @@ def with_mrcal(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...
     index = np.stack([np.arange(count), np.zeros(count), -np.ones(count)], 1).astype(np.int32)
     start = time.process_time()
     mrcal.optimize(
-        intrinsics=intrinsics,
-        extrinsics_rt_fromref=None,
-        frames_rt_toref=frames,
-        points=None,
-        observations_board=seen,
-        indices_frame_camintrinsics_camextrinsics=index,
-        observations_point=None,
-        indices_point_camintrinsics_camextrinsics=None,
+        **problem(intrinsics, None, frames, seen, index),
         lensmodel=f"LENSMODEL_OPENCV{coefficients}",
         imagersizes=np.array([SIZE], np.int32),
         calibration_object_spacing=SQUARE,
@@ -220,7 +216,7 @@ def judge(data: dict[str, np.ndarray], solution: dict[str, np.ndarray], coeffici
 
 
 def run(name: str, path: Path, coefficients: int, timeout: float) -> dict[str, Any]:
-    python = os.environ[PYTHON[name]] if name in PYTHON else sys.executable
+    python = os.environ.get(PYTHON.get(name, "KCAL_OPENCV" if name == "OpenCV" else ""), sys.executable)
     code = f"from scripts.bench.solver import work; work({name!r}, {str(path)!r}, {coefficients})"
     return answer(python, "-c", code, timeout=timeout)
 

@@ -47,6 +47,9 @@ def by_colmap(path: str, points: Any) -> Any:
 def mrcal_solve(path: str) -> Any:
     import mrcal
 
+    sys.path.append(str(Path(__file__).parents[1] / "bench"))
+    from peer_mrcal import problem  # type: ignore[import-not-found, unused-ignore]
+
     draw, lens = np.random.default_rng(0), "LENSMODEL_OPENCV5"
     intrinsics = np.array([[1000.0, 1001, 640, 360, -0.1, 0.02, 1e-3, -5e-4, 0.003]])
     frames = np.concatenate(
@@ -58,9 +61,7 @@ def mrcal_solve(path: str) -> Any:
         corner[..., :2] = mrcal.project(board, lens, intrinsics[0]) + draw.normal(0, 0.2, (7, 7, 2))
     index = np.stack([np.arange(12), np.zeros(12), -np.ones(12)], 1).astype(np.int32)
     inputs = {
-        "intrinsics": intrinsics, "extrinsics_rt_fromref": np.zeros((0, 6)), "frames_rt_toref": frames, "points": None,
-        "observations_board": corners, "indices_frame_camintrinsics_camextrinsics": index, "observations_point": None,
-        "indices_point_camintrinsics_camextrinsics": None, "lensmodel": lens,
+        **problem(intrinsics, np.zeros((0, 6)), frames, corners, index), "lensmodel": lens,
         "imagersizes": np.array([[1280, 720]], dtype=np.int32), "calobject_warp": np.zeros(2),
         "do_optimize_intrinsics_core": True, "do_optimize_intrinsics_distortions": True, "do_optimize_extrinsics": True,
         "do_optimize_frames": True, "do_optimize_calobject_warp": True, "calibration_object_spacing": 0.05,

@@ -1,4 +1,4 @@
-"""mrcal's splined lens on one set of corners, by `scripts/bench/peer_mrcal.py` in the interpreter `KCAL_MRCAL`."""
+"""mrcal or lensboy on one set of corners, by `scripts/bench/peer_NAME.py` in the interpreter `KCAL_NAME`."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ def splined(
     focal: float,
     field_of_view: int | None = None,
     timeout: float | None = None,
+    peer: str = "mrcal",
 ) -> dict[str, Any]:
     """Fit a spline to all views but those held out: seconds, the lens, and w² |r|² of the latter with its count.
 
     Args:
-        lens: for example SPLINED11x8.
+        lens: for example SPLINED11x8; of lensboy OPENCV14, too.
         corners: (V, N, 2) pixels.
         weight: (V, N).
         held: numbers of the views that are held out.
@@ -39,9 +40,10 @@ def splined(
         field_of_view: degrees that the splines cover along x, around the given focal length; None: 170, around the
             focal length that mrcal finds.
         timeout: seconds.
+        peer: mrcal or lensboy.
 
     Raises:
-        subprocess.SubprocessError: mrcal failed, or took longer.
+        subprocess.SubprocessError: it failed, or took longer.
     """
     field = [] if field_of_view is None else [str(field_of_view)]
     with tempfile.TemporaryDirectory() as folder:
@@ -58,7 +60,7 @@ def splined(
             focal=focal,
         )
         done = subprocess.run(
-            [os.environ["KCAL_MRCAL"], "scripts/bench/peer_mrcal.py", str(path), lens, *field],
+            [os.environ[f"KCAL_{peer.upper()}"], f"scripts/bench/peer_{peer}.py", str(path), lens, *field],
             capture_output=True, text=True, timeout=timeout, check=True,
         )  # fmt: skip
     found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
