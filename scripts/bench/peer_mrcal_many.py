@@ -16,12 +16,14 @@ from pathlib import Path
 
 import mrcal  # type: ignore[import-not-found, unused-ignore]
 import numpy as np
-from peer_mrcal import problem  # type: ignore[import-not-found, unused-ignore]
 
 _LENS = "LENSMODEL_OPENCV8"
 
 
 def main() -> None:
+    sys.path.append(str(Path(__file__).parents[2]))
+    from scripts.bench.peer_mrcal import problem
+
     with np.load(sys.argv[1]) as data:
         corners, size, (columns, rows) = data["corners"], data["image_size"].astype(np.int32), data["board_size"]
         square, focal = float(data["square_m"]), float(data["focal"])

@@ -47,8 +47,8 @@ def by_colmap(path: str, points: Any) -> Any:
 def mrcal_solve(path: str) -> Any:
     import mrcal
 
-    sys.path.append(str(Path(__file__).parents[1] / "bench"))
-    from peer_mrcal import problem  # type: ignore[import-not-found, unused-ignore]
+    sys.path.append(str(Path(__file__).parents[2]))
+    from scripts.bench.peer_mrcal import problem
 
     draw, lens = np.random.default_rng(0), "LENSMODEL_OPENCV5"
     intrinsics = np.array([[1000.0, 1001, 640, 360, -0.1, 0.02, 1e-3, -5e-4, 0.003]])

@@ -43,7 +43,9 @@ def merged(
 ) -> Iterator[str]:
     """The table of a page with some rows anew, which their first cells tell; a cell that is None stays as it is."""
     lines = read_section(page, name).splitlines()
-    whole = [[cell.strip() for cell in line[1:-1].split("|")] for line in lines[2:]] if lines[:1] == [row(*heads)] else []
+    whole = (
+        [[cell.strip() for cell in line[1:-1].split("|")] for line in lines[2:]] if lines[:1] == [row(*heads)] else []
+    )
     whole = [cells for cells in whole if len(cells) == len(heads)]
     for cells in rows:
         key = [str(cell) for cell in cells[:keys]]
