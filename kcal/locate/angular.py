@@ -12,6 +12,7 @@ from kcal.checks import as_points
 from kcal.dispatch import CHUNK, is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes
+from kcal.texts import briefly
 
 # Triangulation in closed form, without a decomposition: the point that needs the smallest turns of the rays.
 #
@@ -34,6 +35,7 @@ _SAME_SIDE = 0.1
 Method = Literal["linear", "angular"]
 
 
+@briefly
 class Found(NamedTuple):
     """Points (..., N, 3) and whether each is determined, finite and in front of every camera along its ray (..., N)."""
 
