@@ -69,10 +69,11 @@ def single_camera(source: str | Path) -> kcal.Camera:
         InputError: there is no camera of that name, or there are several and none was named.
     """
     path, name = named_source(str(source))
+    kind = file_kind(path)
     # Without the readers of other programs' files, which take long to load.
-    if file_kind(path) == "camera" and name is None:
+    if kind == "camera" and name is None:
         return kcal.load_camera(path)
-    if file_kind(path) == "rig" and name in (rig := kcal.load_rig(path)).names:
+    if kind == "rig" and name in (rig := kcal.load_rig(path)).names:
         return rig.each[rig.names.index(name)]
     found = kcal.lens.import_cameras(path)
     warn(*found.notes)

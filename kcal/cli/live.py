@@ -313,7 +313,7 @@ def watch_command(
         air = None if temperatures is None else rooms.Temperatures(temperatures)
         watcher = rooms.Watcher(
             known, output, every_s=every, limit_deg=limit, temperatures=air, parquet=parquet,
-            tell=lambda text: err.print(text),
+            tell=err.print,
         )  # fmt: skip
         try:
             if reference_images is not None and watcher.looks == 0 and watcher.last_time == -math.inf:
@@ -350,7 +350,7 @@ def _follow(
     frames, stopped = None, False
     if not Path(sources[0]).is_dir() or bag_and_topic(sources[0]) is not None:
         sizes = {"left": rig.left.size, "right": rig.right.size}
-        frames = rooms.FramesTogether(sources, sizes, pairs=True, tell=lambda text: err.print(text))
+        frames = rooms.FramesTogether(sources, sizes, pairs=True, tell=err.print)
 
     def stop(*_: object) -> None:
         nonlocal stopped

@@ -429,7 +429,8 @@ def rig_solve_command(
             them free.
         keep_all: Leave nothing out; only warn.
         board_warp: Also estimate how the board bends.
-        lens_change: By how much each lens changed since its calibration, at the image's corner (temperature, focus).
+        lens_change: Standard deviation of each lens's change since its calibration, at the image's corner
+            (temperature, focus, transport).
         picture: a plan, and residuals.
     """
     pixel_sigma_and_source(sources.pixel_sigma)

@@ -167,7 +167,7 @@ class CameraInformation:
         return dataclasses.replace(self, rows=rows[:, :-1], residuals=rows[:, -1])
 
     def changed(self, by: Tensor) -> CameraInformation:
-        """What is known once the camera has changed by standard normal amounts times columns (5 + P, K)."""
+        """What is known after a change of the camera by columns (5 + P, K), each times a standard normal amount."""
         count, amounts = self.lens_size, numbered("change", by.shape[1])
         lens = torch.linalg.pinv(self.selection()[:, :count]) @ by
         step = torch.cat([torch.eye(count, dtype=by.dtype), -lens], 1)

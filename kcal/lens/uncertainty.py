@@ -183,14 +183,6 @@ def pixel_slopes(camera: Camera, places: Tensor, at: float, wanted: list[int]) -
     return seen.by_camera.permute(2, 1, 0), by_motion.permute(2, 1, 0), valid & seen.regular
 
 
-# Carry what is known of a camera over to another lens model that stands for it, misfit included.
-
-# Pixels by which parameters that a calibration held may move the image: other programs have no exact parameters.
-_HELD_PX = 1e-4
-# Pixels in proportion to which limits of parameters count where a lens is fitted to another, as in `refit_camera`.
-FIT_PX = 0.01
-
-
 @torch.no_grad()
 def lens_changes(camera: Camera, size: float) -> Tensor:
     """(5 + P, 2) changes of a camera's parameters that scale its image and bend it as r³, as closely as its model can.
@@ -209,6 +201,12 @@ def lens_changes(camera: Camera, size: float) -> Tensor:
     return torch.linalg.lstsq(by_camera[good].flatten(0, 1), fields[good].flatten(0, 1), driver="gelsd").solution
 
 
+# Carry what is known of a camera over to another lens model that stands for it, misfit included.
+
+# Pixels by which parameters that a calibration held may move the image: other programs have no exact parameters.
+_HELD_PX = 1e-4
+# Pixels in proportion to which limits of parameters count where a lens is fitted to another, as in `refit_camera`.
+FIT_PX = 0.01
 # Pixels a unit that no parameter is as weak as.
 _ROUNDING = 1e-12
 

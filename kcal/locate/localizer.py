@@ -438,7 +438,7 @@ class Localizer(Operations, Movable, StatedModule):
         return self._told(found, reach, (enu, covariance, bearing, found.pair_misfit))
 
     def _told(self, found: ViewsFit, reach: Reach, positions: tuple[Tensor, Tensor, Tensor, Tensor]) -> Localization:
-        """All of it, with positions, covariances, bearings and misfits."""
+        """The result, given (positions, covariances, bearings, misfits)."""
         enu, covariance, bearing, misfit = positions
         step, ok = self.freed_step, reach.status == int(PositionStatus.OK)
         return Localization(

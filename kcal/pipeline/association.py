@@ -75,7 +75,7 @@ _MIDDLE = 1.25
 def station_sights(
     localize: Localizer, camera: NDArray[np.int64], pixels: Tensor, sigma: float
 ) -> tuple[StationSights, NDArray[np.bool_]]:
-    """Lines of sight of pixels (N, 2) of cameras (N,), which err by `sigma` px and all common errors; which exist."""
+    """Lines of sight of pixels (N, 2) of cameras (N,), with noise `sigma` px and common errors; which exist."""
     posed, common = localize.posed, localize.common
     place, air = torch.zeros_like(posed.center[:, 0]), 0.0
     if common is not None:
@@ -99,7 +99,7 @@ def station_sights(
 
 
 def near_lines(localize: Localizer, anchors: Sequence[Tensor], options: AssociationOptions, nearest: float) -> Tensor:
-    """(B, N, M) bool: False only for pairs of pixels (B, N, 2) and (B, M, 2) that are of no point for certain.
+    """(B, N, M) bool: False only for pixels (B, N, 2) and (B, M, 2) that certainly do not show one point.
 
     Args:
         localize: of two cameras, with weights by all errors.

@@ -169,7 +169,9 @@ def near_in_angle(lines: StationSights, rows: Ints, others: Ints, gate: float, n
     return rows[first[kept]], others[second[kept]]
 
 
-def in_range(lines: StationSights, pairs: tuple[Ints, Ints], gate: float, ranges: tuple[float, float]) -> Floats:
+def in_range(
+    lines: StationSights, pairs: tuple[Ints, Ints], gate: float, ranges: tuple[float, float]
+) -> NDArray[np.bool_]:
     """(L,) bool: pairs of straight lines that may meet between two ranges from the first camera, within the noise."""
     u, v = (lines.ray[which] for which in pairs)
     a, b = (lines.camera[which] for which in pairs)

@@ -24,19 +24,20 @@ import numpy as np
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from scripts.bench import solver
-from scripts.shared.children import answer
+from scripts.shared.children import ALONE, answer
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import table
 from scripts.shared.peer_lenses import calibrated
 from scripts.shared.real_captures import load, names
 from scripts.shared.sections import section
+from scripts.shared.timing import children_seconds
 from scripts.shared.views import observed, simulate
 
 SPLINE, FEWER = "SPLINED13x9", "SPLINED11x8"
 DEFAULT, MANY, SINGLE = "default camera", "one call", "single calls"
 TYPED = "kcal calibrate, with picture and page"
-OPENCV, ONE_THREAD = "OpenCV, 8 coefficients", {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+OPENCV = "OpenCV, 8 coefficients"
 
 
 def work(way: str, views: int | str, cameras: int) -> None:
@@ -71,11 +72,9 @@ def typed(seen: Observations) -> dict[str, Any]:
         views, camera, picture, page = (str(Path(folder, name)) for name in ("obs.json", "c.json", "c.png", "c.html"))
         seen.save(views)
         words = ["calibrate", views, "-o", camera, "--picture", picture, "--report", page]
-        before = os.times()
-        subprocess.run([sys.executable, "-m", "kcal", *words], capture_output=True, env=os.environ | ONE_THREAD)
-        after = os.times()
-    spent = after.children_user + after.children_system - before.children_user - before.children_system
-    return {"seconds": spent}
+        before = children_seconds()
+        subprocess.run([sys.executable, "-m", "kcal", *words], capture_output=True, env=os.environ | ALONE)
+    return {"seconds": children_seconds() - before}
 
 
 def spline(lens: str, seen: Observations, focal: float, timeout: float) -> dict[str, Any]:

@@ -17,12 +17,12 @@ from multiprocessing.context import ForkServerContext
 from typing import Any
 from unittest import mock
 
-_ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def answer(*command: object, timeout: float | None = None) -> dict[str, Any]:
     """The last line that a process with one thread prints, which is JSON; or {"failed": why}."""
-    words, alone = list(map(str, command)), os.environ | _ALONE
+    words, alone = list(map(str, command)), os.environ | ALONE
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=timeout, check=True, env=alone)
     except subprocess.TimeoutExpired:
@@ -37,6 +37,6 @@ def children(*imported: str) -> ForkServerContext:
     """Start children here; the first call of a process decides which modules these have imported already."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(imported or ("scripts.fuzz.harnesses", "pytest")))
-    with mock.patch.dict(os.environ, _ALONE | {"PYTHONPATH": os.pathsep.join(sys.path)}):
+    with mock.patch.dict(os.environ, ALONE | {"PYTHONPATH": os.pathsep.join(sys.path)}):
         forkserver.ensure_running()
     return context

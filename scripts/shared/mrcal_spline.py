@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from kcal.corners.board import Board
+from scripts.shared.children import ALONE
 
 
 def splined(
@@ -61,7 +62,7 @@ def splined(
         )
         done = subprocess.run(
             [os.environ[f"KCAL_{peer.upper()}"], f"scripts/bench/peer_{peer}.py", str(path), lens, *field],
-            capture_output=True, text=True, timeout=timeout, check=True,
+            capture_output=True, text=True, timeout=timeout, check=True, env=os.environ | ALONE,
         )  # fmt: skip
     found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
     return found

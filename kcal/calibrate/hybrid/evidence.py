@@ -645,8 +645,8 @@ def steps_of_amplitudes(
 ) -> Tensor:
     """(H, S) by how much the best lens and board move with all hyperparameters, for arguments as of `expected_maximum`.
 
-    Each row is a principal direction of their posterior, by one standard deviation. The rows' products are what the
-    covariance at one place lacks (Kass and Steffey 1989).
+    Each row is the move along a principal direction of their posterior, by one standard deviation. The covariance for
+    the best hyperparameters lacks the sum of the rows' outer products (Kass and Steffey 1989).
     """
     loss, log_variance = EvidenceLoss(data, families, hyperprior, tempering), math.log(best.variance)
     at = np.concatenate([best.h.numpy(), best.log_ratio, [log_variance]])

@@ -204,9 +204,9 @@ class RigOptions:
         refraction: of light towards landmarks, as a share of the Earth's curvature; estimated from here. For
             simulations and other straight lines it and its sigma are 0.
         refraction_sigma: its standard deviation beforehand; 0 holds it.
-        lens_change: pixels at the image's corner by which scale and r³ of each lens changed since its calibration
-            (standard deviation of each): by temperature, focus, transport. What the rig's data say of it counts.
-            (A shift of the image is a turn of the camera.)
+        lens_change: standard deviation, in pixels at the image's corner, of the changes of each lens's scale and r³
+            since its calibration (temperature, focus, transport). The rig's data may determine them better. A shift
+            of the image is not among them: it is a turn of the camera.
         solver: options of the Levenberg-Marquardt solver; residuals are in sigmas.
     """
 
