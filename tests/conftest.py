@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,13 @@ def pytest_configure(config: pytest.Config) -> None:
     """No test waits for more than a minute."""
     if sys.platform == "linux":
         config.pluginmanager.register(Watch(float(os.environ.get("KCAL_WAIT", "60"))))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with the most slow tests come first, so that no process works on one while the others have ended."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 # The states in which the generators of modules of tests began.

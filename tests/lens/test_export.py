@@ -81,7 +81,7 @@ def test_compiles_as_one_graph_and_exports(preset: str, direction: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("direction", DIRECTIONS)
-@pytest.mark.parametrize("preset", ["opencv5", "opencv14", "fisheye4", "hybrid"])
+@pytest.mark.parametrize("preset", ["opencv14", "fisheye4", "hybrid"])
 def test_onnx(preset: str, direction: str, tmp_path: Path) -> None:
     camera = make_camera(preset)
     module, points = module_and_input(camera, direction)
@@ -111,17 +111,6 @@ def test_onnx_keeps_a_factor_that_is_almost_one(tmp_path: Path) -> None:
     session = onnxruntime.InferenceSession(save_onnx(Almost(), x, tmp_path / "factor.onnx"))
     (found,) = session.run(None, {session.get_inputs()[0].name: x.numpy()})
     torch.testing.assert_close(torch.from_numpy(found), Almost()(x), rtol=1e-15, atol=0)
-
-
-@pytest.mark.slow
-def test_onnx_keeps_factors_that_are_almost_one(tmp_path: Path) -> None:
-    """onnxscript 0.7 takes cos 0.004 for one if it may: 0.008 px, and unprojection finds no ray at all."""
-    lens = [-0.28, 0.1, 5e-4, -3e-4, 0.02, 0.05, 0.02, 0.01, 4e-4, -2e-4, -3e-4, 1e-4, 0.004, -0.006]
-    camera = Camera.build(focal=(1600, 1605), center=(957, 541), size=(1920, 1080), coefficients=lens, model="opencv14")
-    points = camera.unproject(camera.grid(9, 7).reshape(-1, 2))[0]
-    session = onnxruntime.InferenceSession(save_onnx(camera, points, tmp_path / "camera.onnx"))
-    values, valid = session.run(None, {session.get_inputs()[0].name: points.numpy()})
-    assert_same((torch.from_numpy(values), torch.from_numpy(valid)), camera.project(points))
 
 
 class Numbers(nn.Module):

@@ -72,13 +72,13 @@ class TestRoundTrip:
     @settings(max_examples=15, deadline=None)
     @given(seed=st.integers(0, 2**31), scale=st.floats(0.01, 3.0), model=st.sampled_from(MODELS))
     def test_any_coefficients(self, seed: int, scale: float, model: str) -> None:
-        """Random lenses, most of them absurd: 16 at a time, valid or flagged, never wrong."""
+        """Random lenses, most of them absurd: four at a time, valid or flagged, never wrong."""
         generator = torch.Generator().manual_seed(seed)
         size = LensModel.named(model).size
-        lens = torch.randn(16, size, generator=generator, dtype=torch.float64) * scale * 0.3
-        head = torch.tensor([2000.0, 1900.0, 960.0, 540.0, 1.0], dtype=torch.float64).expand(16, 5)
+        lens = torch.randn(4, size, generator=generator, dtype=torch.float64) * scale * 0.3
+        head = torch.tensor([2000.0, 1900.0, 960.0, 540.0, 1.0], dtype=torch.float64).expand(4, 5)
         camera = Camera(torch.cat([head, lens], -1), size=(1920, 1080), model=model)
-        pixels = torch.rand(16, 40, 2, generator=generator, dtype=torch.float64) * 4000.0 - 1000.0
+        pixels = torch.rand(4, 40, 2, generator=generator, dtype=torch.float64) * 4000.0 - 1000.0
         rays, valid = camera.unproject(pixels)
         assert bool(torch.isfinite(rays).all())
         axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -95,11 +95,11 @@ class TestRoundTrip:
         """The other way round: a point that `project` calls valid comes back as the same ray."""
         generator = torch.Generator().manual_seed(seed)
         size = LensModel.named(model).size
-        lens = torch.randn(16, size, generator=generator, dtype=torch.float64) * scale * 0.1
+        lens = torch.randn(4, size, generator=generator, dtype=torch.float64) * scale * 0.1
         limit = valid_region(lens, model).radius.clamp(max=3.0)
-        angle = torch.rand(16, 40, generator=generator, dtype=torch.float64) * 2 * math.pi
+        angle = torch.rand(4, 40, generator=generator, dtype=torch.float64) * 2 * math.pi
         # Within nine tenths of the fold; at the fold itself the inverse has no finite derivative.
-        radius = 0.9 * limit[:, None] * torch.rand(16, 40, generator=generator, dtype=torch.float64)
+        radius = 0.9 * limit[:, None] * torch.rand(4, 40, generator=generator, dtype=torch.float64)
         normalized = torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)], -1)
         distorted, jacobian, _ = distort_with_jacobian(normalized, lens, model)
         back, valid = undistort(distorted, lens, model)

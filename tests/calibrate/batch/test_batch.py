@@ -262,10 +262,25 @@ class TestSharing:
         for name, result in zip(("east", "west"), calibrate_cameras(seen), strict=True):
             kept = load_camera(out / f"{name}.camera.json")
             torch.testing.assert_close(kept.params, result.camera.params, rtol=1e-12, atol=0)
-        # Once more, nothing is left to do.
+        # Once more, nothing is left to do: of each camera four images, the calibration alone, and that with both.
+        monkeypatch.setattr(Pool, "submit", lambda _, task: crew.submit(task))
         before = len(crew.tasks)
-        self.batch(folder, out, crew)
-        assert len(crew.tasks) == before
+        again = kcal("batch", folder, *WHAT, "-o", out)
+        assert (again.exit_code, len(crew.tasks)) == (0, before)
+        assert "12 of 12 pieces of work were there already" in again.output
+        (folder / "empty").mkdir()
+        result = kcal("batch", folder, *WHAT, "-o", out)
+        assert result.exit_code == 1
+        assert "1 of 3 cameras failed: empty" in str(result.exception)
+        assert "4 of 4" in result.output
+        with (out / "summary.csv").open() as file:
+            assert [row["status"] for row in csv.DictReader(file)] == ["ok", "failed", "ok"]
+
+
+def test_refusals_of_the_command(folder, place):
+    for words, message in (("--board 6x5", "give the side of its squares"), ("--square 1 --model best", "model")):
+        assert message in str(kcal("batch", folder, *words.split(), "-o", place / "none").exception)
+    assert not (place / "none").exists()
 
 
 def test_images_that_were_resized_are_scaled_and_it_is_said(folder, images, place):
@@ -372,27 +387,6 @@ def test_a_killed_run_continues_and_gives_the_same_table(folder, first, place):
                 assert float(row[key]) == pytest.approx(value, rel=1e-4)
             else:
                 assert row[key] == ("" if value is None else str(value))
-
-
-@pytest.mark.slow
-def test_command_line(folder, place, monkeypatch):
-    monkeypatch.setattr(Pool, "submit", lambda _, task: Here().submit(task))
-    (folder / "empty").mkdir()
-    result = kcal("batch", folder, *WHAT, "-o", place / "new")
-    assert result.exit_code == 1
-    assert "1 of 3 cameras failed: empty" in str(result.exception)
-    assert "4 of 4" in result.output
-    with (place / "new" / "summary.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["status"] for row in rows] == ["ok", "failed", "ok"]
-    (folder / "empty").rmdir()
-    again = kcal("batch", folder, *WHAT, "-o", place / "new")
-    assert again.exit_code == 0
-    # Of each camera, four images, the calibration alone, and that with what both share.
-    assert "12 of 12 pieces of work were there already" in again.output
-    assert "give the side of its squares" in str(kcal("batch", folder, "--board", "6x5", "-o", place / "new").exception)
-    assert "model" in str(kcal("batch", folder, *WHAT, "--model", "best", "-o", place / "new").exception)
-    assert not (place / "none").exists()
 
 
 def test_the_lines_of_finished_cameras_are_not_kept(folder, place):
