@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +13,9 @@ import pytest
 from browser import at_rest, chromium_page, needs_browser, violations
 
 pytest.importorskip("uvicorn", reason="the extra `mark` is not installed")
-from pages import PAGES, build_site
+from pages import PAGES
 
-pytestmark = needs_browser
+ROOT = Path(__file__).parents[1]
 # Wide, and as wide as a telephone.
 SIZES = ((1280, 800), (390, 844))
 SHOTS = os.environ.get("KCAL_SHOTS")  # a folder for pictures of all pages, to be looked at
@@ -32,6 +35,7 @@ def faults(page: Any, name: str) -> list[str]:
     return found + page.complaints
 
 
+@needs_browser
 @pytest.mark.parametrize("name", PAGES)
 def test_axe_finds_nothing(name: str, tmp_path: Path) -> None:
     with PAGES[name](tmp_path) as (address, ready), chromium_page() as page:
@@ -43,9 +47,24 @@ def test_axe_finds_nothing(name: str, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_site(tmp_path_factory.mktemp("docs") / "site")
+    """The documentation's site, as `make docs` does it. Broken links and anchors are warnings, which are errors."""
+    pytest.importorskip("mkdocs")
+    folder = tmp_path_factory.mktemp("docs") / "site"
+    words = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(folder)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
 
 
+@pytest.mark.slow
+def test_the_documentation_needs_no_other_site(site: Path) -> None:
+    assert "Localizer" in (site / "search" / "search_index.js").read_text(encoding="utf-8")
+    pages = [path.read_text(encoding="utf-8") for path in site.rglob("*.html")]
+    assert [page for page in pages if re.search(r'<(script|link|img)[^>]*(src|href)="https?:', page)] == []
+
+
+@needs_browser
 @pytest.mark.slow
 def test_axe_finds_nothing_in_the_documentation(site: Path) -> None:
     found = []
@@ -62,6 +81,8 @@ def test_axe_finds_nothing_in_the_documentation(site: Path) -> None:
     assert not found, "\n".join(found)
 
 
+@needs_browser
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [width for width, _ in SIZES])
 def test_the_tutorial_is_found_and_read(site: Path, width: int) -> None:
     with chromium_page(width, 844) as page:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -169,10 +167,3 @@ def summary(folder: Path) -> Iterator[Opened]:
 PAGES: dict[str, Callable[[Path], AbstractContextManager[Opened]]] = {
     "mark": marking, "capture": capturing, "live": live, "verdict": verdict, "map": written_map, "summary": summary,
 }  # fmt: skip
-
-
-def build_site(folder: Path) -> Path:
-    """The documentation's site, as `make docs` does it."""
-    words = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "-d", str(folder)]
-    subprocess.run(words, cwd=ROOT, check=True, capture_output=True)
-    return folder
