@@ -197,14 +197,14 @@ BAD: dict[str, Callable[[int], Any]] = {
 }
 
 
-@pytest.mark.parametrize("bad", BAD)
 @pytest.mark.parametrize("door", DOORS)
-def test_no_other_error_reaches_a_user(door: str, bad: str) -> None:
+def test_no_other_error_reaches_a_user(door: str) -> None:
     call, last = DOORS[door]
-    if bad == "elsewhere" and door in ELSEWHERE:
-        return
-    with pytest.raises(InputError):
-        call(BAD[bad](last))
+    for bad, make in BAD.items():
+        if bad == "elsewhere" and door in ELSEWHERE:
+            continue
+        with pytest.raises(InputError):
+            call(make(last))
 
 
 def test_shapes_that_would_mix_rows_are_refused() -> None:

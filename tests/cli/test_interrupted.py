@@ -78,13 +78,10 @@ def test_while_an_image_is_searched(folder: Path) -> None:
     ("line", "moments"),
     [
         ("calibrate left.obs.json -o new.camera.json", ["step:2", "write:1"]),
-        ("report near.camera.json --observations left.obs.json -o left.html", ["step:3"]),
-        ("compare left.obs.json pinhole opencv5", ["step:2"]),
         ("board measure left.obs.json -o plate.board.json --picture plate.png", ["step:1", "write:2"]),
         ("detect images --board 7x6 --square 50mm -o new.obs.json --refine saddle", ["step:1", "write:1"]),
         ("rectify near.camera.json images -o straight", ["write:2"]),
         ("rig left.camera.json right.camera.json --landmarks survey.csv --marks marks.csv -o rig.json", ["step:4"]),
-        ("bake left.camera.json -o table.npz", ["write:1"]),
         ("demo -o site", ["step:1", "write:2"]),
         ("batch cameras --board 7x6 --square 50mm -o results --workers 2", ["step:1"]),
     ],

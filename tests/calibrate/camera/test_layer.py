@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import pytest
 import torch
@@ -69,7 +70,7 @@ def test_derivatives_are_those_of_solving_anew(options: CalibrationOptions) -> N
 
     # Central differences over 1e-4 px of solutions that are exact to some 1e-11 px.
     zero = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(solve, (zero,), eps=1e-4, atol=5e-6, rtol=5e-6)
+    assert torch.autograd.gradcheck(solve, (zero,), eps=1e-4, atol=5e-6, rtol=5e-6, fast_mode=True)
 
 
 # What Gauss and Newton leave out of the Hessian is a percent of it, and more of that of a robust loss, where the
@@ -115,11 +116,13 @@ def test_values_do_not_depend_on_backward_and_none_carries_nothing() -> None:
     assert [one.parameters.requires_grad for one in found] == [True, True, False]
 
 
+@functools.cache
+def default_lens() -> CalibratedViews:
+    return calibrate_views(CORNERS, BOARD.points, SIZE, backward="none")
+
+
 class TestDefaultLens:
     """The hybrid lens, with printed boards and motion: gradients at amplitudes that are held."""
-
-    def base(self) -> CalibratedViews:
-        return calibrate_views(CORNERS, BOARD.points, SIZE, backward="none")
 
     @pytest.mark.slow
     def test_it_is_the_default(self) -> None:
@@ -127,7 +130,7 @@ class TestDefaultLens:
 
         from kcal.calibrate.camera.calibrate import calibrate_camera
 
-        found, result = self.base(), calibrate_camera(observe(CORNERS))
+        found, result = default_lens(), calibrate_camera(observe(CORNERS))
         assert found.model.hybrid
         for name, ours, theirs in zip(
             result.camera.names, found.parameters.tolist(), result.camera.params.tolist(), strict=True
@@ -139,7 +142,7 @@ class TestDefaultLens:
 
     @pytest.mark.slow
     def test_derivatives_are_those_of_solving_anew(self) -> None:
-        base = self.base()
+        base = default_lens()
         generator = torch.Generator().manual_seed(2)
         along = torch.randn(2, *CORNERS.shape, generator=generator, dtype=torch.float64)
         board = 1e-3 * torch.randn(2, *BOARD.points.shape, generator=generator, dtype=torch.float64)
@@ -150,11 +153,11 @@ class TestDefaultLens:
             return summary(calibrate_views(corners, points, SIZE, start=base))
 
         zero = torch.zeros(2, dtype=torch.float64, requires_grad=True)
-        assert torch.autograd.gradcheck(solve, (zero,), eps=1e-4, atol=2e-5, rtol=2e-5)
+        assert torch.autograd.gradcheck(solve, (zero,), eps=1e-4, atol=2e-5, rtol=2e-5, fast_mode=True)
 
     @pytest.mark.slow
     def test_recorded_steps_have_the_same_derivatives(self) -> None:
-        base, gradients = self.base(), []
+        base, gradients = default_lens(), []
         for backward in ("implicit", "unroll"):
             corners = CORNERS.clone().requires_grad_(True)
             found = CalibrationLayer(SIZE, backward=backward)(corners, BOARD.points, start=base)
@@ -165,7 +168,7 @@ class TestDefaultLens:
 
     @pytest.mark.slow
     def test_a_start_keeps_the_amplitudes(self) -> None:
-        base = self.base()
+        base = default_lens()
         again = calibrate_views(CORNERS + 1e-3, BOARD.points, SIZE, start=base, backward="none")
         assert base.fit is not None
         assert again.fit is base.fit
@@ -175,7 +178,7 @@ class TestDefaultLens:
         torch.testing.assert_close(moved, torch.full((2,), 1e-3).double(), rtol=0.1, atol=0)
 
     def test_refusals(self) -> None:
-        base = self.base()
+        base = default_lens()
         with pytest.raises(InputError, match="measures the noise"):
             calibrate_views(CORNERS, BOARD.points, SIZE, corner_sigma=0.1)
         with pytest.raises(InputError, match="another lens model"):

@@ -1,4 +1,4 @@
-"""The covariance of all parameters and of projections: algebra, OpenCV's figures, and repeated captures."""
+"""The covariance of all parameters and of projections: algebra, and OpenCV's figures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from kcal.calibrate.problem.views import free_parameters, information_of, noise_
 from kcal.errors import DegenerateError
 from kcal.gaussian import Covariance
 from kcal.lens.model import LensModel
-from kcal.lens.projection import project_components
 from kcal.solve.lm import LMOptions, minimize
 from kcal.solve.schur import SchurLinearization
 
@@ -100,44 +99,6 @@ def test_sigma_is_opencvs() -> None:
     )  # fmt: skip
     # OpenCV's board corners are float32, 1e-5 px of 0.28 px residuals.
     torch.testing.assert_close(found.sigma, torch.from_numpy(out[5])[:9, 0], rtol=1e-4, atol=0)
-
-
-@pytest.mark.slow
-def test_monte_carlo_of_projections() -> None:
-    """80 repetitions of one capture: scatter against prediction, by χ².
-
-    For each of four image places, d² = eᵀ Σ⁻¹ e with the error e against the truth sums to χ² with 80 x 2 degrees of
-    freedom, but for the noise being estimated from 600 spare residuals, which adds less than
-    1 %. With the Wilson-Hilferty bounds of 4.5 standard deviations, 7e-6 of captures fall outside each. Standard 95 %
-    ellipses: of 80, at least 66 hold the truth but in 1e-5 of captures (binomial), for each place.
-    """
-    repeats, model = 80, "opencv5"
-    truth = camera(model)
-    poses = motions(truth, 8, 33)
-    places = torch.tensor([[320.0, 240.0], [60.0, 50.0], [590.0, 60.0], [80.0, 420.0]]).double()
-    rays, valid = truth.normalize(places)
-    assert bool(valid.all())
-    points = torch.cat([rays, torch.ones(4, 1).double()], 1)
-    free = free_parameters(truth.model)
-    squared = []
-    for seed in range(repeats):
-        state, found = solved(pixels_of(truth, poses, noise=0.2, seed=seed + 500), model, poses)
-        seen = project_components(points.T, state.parameters, truth.model, free)
-        error, slope = seen.pixels.T - places, seen.by_camera.permute(2, 1, 0)
-        spot = slope @ found.matrix @ slope.mT
-        squared.append((error * torch.linalg.solve(spot, error)).sum(-1))
-    distances = torch.stack(squared)
-    for k in range(4):
-        low, high = chi_square_bounds(2 * repeats, 4.5)
-        assert low < float(distances[:, k].sum()) < high, k
-        assert int((distances[:, k] < 5.991).sum()) >= 66, k
-
-
-def chi_square_bounds(freedom: int, deviations: float) -> tuple[float, float]:
-    """Wilson and Hilferty's: (χ² / n)^(1/3) is normal about 1 - 2 / (9 n) with variance 2 / (9 n)."""
-    share = 2.0 / (9.0 * freedom)
-    low, high = (freedom * (1.0 - share + sign * deviations * share**0.5) ** 3 for sign in (-1.0, 1.0))
-    return low, high
 
 
 class TestWhatCannotBeComputed:
