@@ -63,7 +63,7 @@ def file_kind(path: str | Path) -> str:
             return "bag" if _is_bag_folder(path) else "folder"
         if not stat.S_ISREG(about.st_mode):
             return "device"
-        with open(path, "rb") as file:
+        with Path(path).open("rb") as file:  # a number is refused: it would be a file that is open already
             head = file.read(_HEAD)
     except (OSError, ValueError):
         return "missing"

@@ -137,12 +137,19 @@ def test_images_to_detect_in(tmp_path: Path) -> None:
         ([np.zeros((120, 160, 3), np.uint8)], r"image 0: a color image \(120, 160, 3\); .*cv2.COLOR_BGR2GRAY"),
         (np.zeros((3, 120, 160), np.uint8), r"a batch \(B, 1, H, W\) or a list is needed, got \(3, 120, 160\)"),
         (BOARD, "detect: paths: .* is needed, got Board"),
-        ([3], "detect: paths: .* is needed, got list of int"),
     ],
 )
 def test_what_shows_no_images(given: Any, message: str) -> None:
     with pytest.raises(kcal.KcalError, match=message):
         kcal.detect(given, BOARD)
+
+
+def test_a_number_is_no_path(tmp_path: Path) -> None:
+    """It was taken for an open file, which was read and closed."""
+    with (tmp_path / "mine").open("w") as file:
+        with pytest.raises(InputError, match=r"detect: paths: .* is needed, got list of int"):
+            kcal.detect([file.fileno()], BOARD)
+        file.write("whole")
 
 
 RIG = Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
