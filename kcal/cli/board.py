@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +14,7 @@ from kcal.cli import kinds, rooms
 from kcal.cli.console import board_words, ending_with, err, out, print_left_out, print_wrote, steps, tell, warn
 from kcal.cli.inputs import typed, typed_with
 from kcal.cli.options import Kind
-from kcal.errors import InputError
+from kcal.errors import InputError, KcalError
 from kcal.files import check_writable, is_stream, make_folder, source_name, write_atomic
 
 
@@ -164,11 +163,8 @@ def detect_command(
             NAME_right, with views of the same moments.
     """
     given = given_board(board, square)
-
     failed: list[tuple[str, Path, rooms.Detection]] = []
-
     turned: list[Path] = []
-    notes: list[str] = []
     streams = [source_name(image) for image in images if is_stream(image)]
     if streams and len(images) > 1:
         raise InputError(f"{streams[0]}: a stream is searched alone, without other images")
@@ -196,7 +192,7 @@ def detect_command(
         check_writable(output, *paths)
         pattern = given or board_in_images(paths, square, time_limit)
         with (
-            ending_with(lambda error: _next_command(str(error), board, pattern, images, paths, output)),
+            ending_with(lambda error: _next_command(error, board, pattern, images, paths, output)),
             steps("detecting", len(paths)) as advance,
         ):
             seen = kcal.detect(
@@ -205,8 +201,8 @@ def detect_command(
                 refine,
                 progress=advance,
                 time_limit=time_limit,
-                note=notes.append,
-                on_failure=lambda name, path, found: failed.append((name, path, found)),
+                note=warn,
+                on_failure=lambda *one: failed.append(one),
             )
         observed = [seen]
         turned = rooms.turned_images([path for path in paths if os.path.isfile(path)])
@@ -228,7 +224,6 @@ def detect_command(
         out.print(f"{path}: board found in {len(one.views)} {source} of {width}x{height} px")
     wide, high = (1e3 * side for side in pattern.extent)
     out.print(f"board {pattern}: {wide:g} x {high:g} mm from the first point to the last")
-    warn(*notes)
     if turned:
         out.print(
             f"note: {len(turned)} images have an EXIF rotation, of {len(paths)}, which kcal ignores: corners are in "
@@ -275,29 +270,27 @@ _CURED = 6  # images that are looked at to name the board of a refusal
 
 
 def _next_command(
-    refusal: str, given: str, board: kcal.Board, images: Sequence[str], paths: Sequence[Path], output: Path
+    refusal: KcalError, given: str, board: kcal.Board, images: Sequence[str], paths: Sequence[Path], output: Path
 ) -> str:
     """The command for images of each size, that with the board that was found, or one that draws the board."""
-    if "different sizes" in refusal:
-        return f"To split them: {' && '.join(_of_each_size(images, paths, output))}"
-    found = re.search(r"a board of (\d+x\d+)", refusal) or re.search(r"give --board ((?:\w+:)?\d+x\d\S*)$", refusal)
-    text = found[1] if found else ""
-    if "COLUMNSxROWS" in refusal:
-        seen = rooms.recognize_images(paths, _CURED).seen
-        text = seen.text if seen is not None else ""
-    if text and given in typed:
-        return f"Perhaps: {typed_with({given: text})}"
+    if isinstance(refusal, rooms.SizesError):
+        return f"To split them: {' && '.join(_of_each_size(refusal.groups, images, paths, output))}"
+    if isinstance(refusal, rooms.OtherBoardError) and given in typed:
+        seen = rooms.recognize_images(refusal.images, _CURED).seen
+        if seen is not None and seen.other_than(board):
+            return f"Perhaps: {typed_with({given: seen.text})}"
     return f"To see what this board looks like: kcal board {board_words(board)} -o board.svg"
 
 
-def _of_each_size(images: Sequence[str], paths: Sequence[Path], output: Path) -> Iterator[str]:
+def _of_each_size(
+    groups: Mapping[tuple[int, int], Sequence[int]], images: Sequence[str], paths: Sequence[Path], output: Path
+) -> Iterator[str]:
     """A command for the images of each size, those of most first; sizes that may be of one camera stay together."""
-    groups: dict[tuple[int, int], list[str]] = {}
-    for path in paths:
-        if (size := rooms.size_of(path)) is not None:
-            alike = (other for other in groups if rooms.nearly(size, other) or rooms.resized_alike(size, other))
-            groups.setdefault(next(alike, size), []).append(str(path))
-    for (width, height), files in sorted(groups.items(), key=lambda group: -len(group[1])):
+    together: dict[tuple[int, int], list[int]] = {}
+    for size, numbers in groups.items():
+        alike = (other for other in together if rooms.nearly(size, other) or rooms.resized_alike(size, other))
+        together.setdefault(next(alike, size), []).extend(numbers)
+    for (width, height), numbers in sorted(together.items(), key=lambda group: -len(group[1])):
         own = output.with_name(f"{output.name.split('.')[0]}-{width}x{height}.obs.json")
         words = [str(own) if word == str(output) else word for word in typed if word not in images]
-        yield shlex.join(["kcal", words[0], *files, *words[1:]])
+        yield shlex.join(["kcal", words[0], *(str(paths[number]) for number in sorted(numbers)), *words[1:]])

@@ -58,20 +58,7 @@ def told_calibration(
         pupil = measured_text(1e3 * brief.pupil, 1e3 * brief.pupil_sigma, "mm", sign=True)
         out.print(f"entrance pupil: {pupil} at the image's corner")
     if (board := result.measured_board) is not None and bool(board.amplitudes.any()):
-        (bend, bend_s), (wide, wide_s), (skew, skew_s), (rest, rest_s) = (
-            board.bending, board.stretch, board.shear, board.print_error,
-        )  # fmt: skip
-        out.print(
-            f"board: bends by {measured_text(1e3 * bend, 1e3 * bend_s, 'mm')}; "
-            f"stretch {measured_text(100 * wide, 100 * wide_s, '%', sign=True)}, "
-            f"shear {measured_text(100 * skew, 100 * skew_s, '%', sign=True)}, "
-            f"print {measured_text(1e3 * rest, 1e3 * rest_s, 'mm')}"
-            + (
-                f"; single corners are off by {number_text(1e3 * board.corner_error, digits=2)} mm (RMS) beside this"
-                if board.corner_error
-                else ""
-            )
-        )
+        out.print(f"board: {'; '.join(rooms.board_text(board))}")
     if verbose:
         print_table([["parameter", "value", "± σ"], *_parameters(result)])
     if result.board_warp is not None:

@@ -120,7 +120,14 @@ def live_command(
         # The rig as it stands at each second, by a history that grows, and how many errors more that has.
         moments, moving = rooms.Followed(options.history, localize), rooms.MORE_ERRORS
     tracker = kcal.track.Tracker(localize, follow, clock=clock, compiled=compile, moments=moments, moving=moving)
-    frames = _videos(videos, detector, solved, tracker, joining, match_sigma) if videos and detector else None
+    frames = None
+    if videos and detector:
+        # As `python -m` does: a detector beside which the command is run is found.
+        sys.path.insert(0, os.getcwd())
+        frames = rooms.Videos(
+            videos, solved, rooms.load_detector(detector), joining, late=lambda camera: _late(tracker, camera),
+            match_sigma=match_sigma, tell=err.print,
+        )  # fmt: skip
     source = frames or rooms.lines_of(
         lines, lambda line: rooms.read_moment(line, solved, joining, float(localize.pixel_sigma))
     )
@@ -192,34 +199,20 @@ def summary(counts: rooms.StreamCounts) -> str:
 
 def _localizer(path: Path, rig: kcal.Rig, options: LocateOptions, *, many: bool) -> kcal.Localizer:
     """Of two cameras, or of many."""
+    noise = pixel_sigma_of(options.pixel_sigma, rig)
     if not many:
-        return pair_localizer(rig, options, pixel_sigma_of(options.pixel_sigma, rig))(rig)
-    known = rooms.stations_of(rig)
-    if known.origin is None:
+        return pair_localizer(rig, options, noise)(rig)
+    localize = kcal.Localizer(rig, weights="all", pixel_sigma=noise)
+    if localize.rig.origin is None:
         raise InputError(
             f"{path}: this rig has no place on the Earth; solve it with landmarks or positions with latitudes"
         )
-    return kcal.Localizer(known, weights="all", pixel_sigma=pixel_sigma_of(options.pixel_sigma, known))
+    return localize
 
 
-def _videos(
-    videos: list[str],
-    detector: str,
-    rig: kcal.Rig | kcal.Localizer,
-    tracker: kcal.track.Tracker,
-    options: kcal.track.AssociationOptions,
-    match_sigma: float,
-) -> rooms.Videos:
-    # As `python -m` does: a detector beside which the command is run is found.
-    sys.path.insert(0, os.getcwd())
-
-    def late(camera: int) -> float:
-        # Before the first moment the estimate is the prior.
-        return tracker.clock_estimate(camera).offset(max(tracker.time, tracker.shared.start or 0.0))[0]
-
-    return rooms.Videos(
-        videos, rig, rooms.load_detector(detector), options, late=late, match_sigma=match_sigma, tell=err.print
-    )
+def _late(tracker: kcal.track.Tracker, camera: int) -> float:
+    # Before the first moment the estimate is the prior.
+    return tracker.clock_estimate(camera).offset(max(tracker.time, tracker.shared.start or 0.0))[0]
 
 
 def _progress(

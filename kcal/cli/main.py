@@ -97,10 +97,10 @@ def _global_options(
 # Each command, and the module here that has its function.
 COMMANDS = {
     "demo": "demo", "init": "options", "capture": "pages", "detect": "board", "calibrate": "calibrate",
-    "interpolate": "compare", "compare": "compare", "batch": "calibrate", "mark": "pages", "station": "rig",
+    "interpolate": "cameras", "compare": "cameras", "batch": "calibrate", "mark": "pages", "station": "rig",
     "place": "rig", "stars": "stars", "locate": "locate", "live": "live", "watch": "live", "budget": "sites",
-    "sites": "sites", "rectify": "rectify", "rays": "rectify", "bake": "compare", "export": "exchange",
-    "import": "exchange", "schema": "exchange", "show": "show", "view": "show", "diff": "compare", "check": "report",
+    "sites": "sites", "rectify": "rectify", "rays": "rectify", "bake": "cameras", "export": "cameras",
+    "import": "cameras", "schema": "cameras", "show": "show", "view": "show", "diff": "cameras", "check": "report",
     "report": "report", "board print": "board", "board measure": "board", "rig solve": "rig", "rig check": "rig",
 }  # fmt: skip
 # They run on, or write where they are told.

@@ -307,16 +307,14 @@ def described(docstring: str | None) -> tuple[str, dict[str, str]]:
 
 
 def _declared_options(
-    parameters: Sequence[inspect.Parameter | dataclasses.Field[Any]], about: dict[str, str], group: str | None = None
+    parameters: Sequence[inspect.Parameter], about: dict[str, str], group: str | None = None
 ) -> Iterator[_Option]:
     for each in parameters:
-        plain, more = _taken_apart(each.annotation if isinstance(each, inspect.Parameter) else each.type)
-        default = each.default
-        if isinstance(each, dataclasses.Field) and each.default_factory is not dataclasses.MISSING:
-            default = each.default_factory()
+        plain, more = _taken_apart(each.annotation)
         if dataclasses.is_dataclass(plain) and group is None:
             only = next((one.names for one in more if isinstance(one, Only)), None)
-            fields = [field for field in _typed_fields(plain) if only is None or field.name in only]
+            every = inspect.signature(plain, eval_str=True).parameters  # type: ignore[arg-type]
+            fields = [field for field in every.values() if only is None or field.name in only]
             yield from _declared_options(fields, about | described(plain.__doc__)[1], each.name)
             continue
         kinds = [one for one in more if isinstance(one, Kind)]
@@ -331,16 +329,9 @@ def _declared_options(
             name=each.name, type=plain, kind=kind, group=group,
             about=kind.about.format(about[each.name]) if "{}" in kind.about else kind.about,
             wanted=next((one for one in more if isinstance(one, Wanted)), None),
-            default=inspect.Parameter.empty if default is dataclasses.MISSING else default,
-            argument=isinstance(each, inspect.Parameter) and each.kind is not each.KEYWORD_ONLY,
+            default=each.default,
+            argument=each.kind is not each.KEYWORD_ONLY,
         )  # fmt: skip
-
-
-def _typed_fields(cls: Any) -> Iterator[dataclasses.Field[Any]]:
-    hints = inspect.get_annotations(cls, eval_str=True)
-    for field in dataclasses.fields(cls):
-        field.type = hints[field.name]
-        yield field
 
 
 def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..., None]:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import kcal
 from kcal.cli import kinds, rooms
@@ -19,7 +19,6 @@ from kcal.cli.options import Kind
 from kcal.errors import FileError, InputError
 from kcal.files import check_writable, make_folder, read_bytes, write_atomic
 
-_T = TypeVar("_T")
 _HEAD = 256  # bytes of a PNG file, in which its note stands
 
 # Images of one camera, resampled into a folder: image by image, so that a run that was interrupted continues.
@@ -166,19 +165,13 @@ def rig_of(source: str) -> kcal.Rig | None:
 
 
 @contextmanager
-def _resampled(
-    folder: Path,
-    images: dict[Path, list[Path]],
-    extras: list[Path],
-    make: Callable[[], tuple[_T, list[kcal.lens.Undistort]]],
-) -> Iterator[tuple[_T, list[kcal.lens.Undistort]]]:
-    """Resample the images of each camera, and say it; meanwhile the other files are written. Fail last.
+def _resampling(folder: Path, images: dict[Path, list[Path]], extras: list[Path]) -> Iterator[Callable[..., None]]:
+    """Call the value with what resamples each camera's images; meanwhile the other files are written. Fail last.
 
     Args:
         folder: of the extras.
         images: folder of a camera's new images -> the images of this camera.
         extras: other files that will be written.
-        make: makes the view, and what resamples each camera's images; this takes a moment.
     """
     targets = {place: targets_of(paths, place, extras) for place, paths in images.items()}
     # What could not be written later is refused now.
@@ -186,21 +179,22 @@ def _resampled(
         make_folder(place)
         for path in files:
             check_writable(path)
-    count = sum(map(len, images.values()))
-    before, failures = 0, list[str]()
-    with steps("rectifying", 1 + count) as advance:
-        made, modules = make()
-        advance("maps")
-        for (place, paths), module in zip(images.items(), modules, strict=False):
-            done, wrong = convert_images(paths, targets[place], module, advance)
-            before, failures = before + done, failures + wrong
-    if count and len(failures) == count:
-        raise FileError(f"none of {count} images could be resampled: {failures[0]}")
-    if count:
+    count, failures = sum(map(len, images.values())), list[str]()
+
+    def resample(*modules: kcal.lens.Undistort) -> None:
+        before = 0
+        with steps("rectifying", count) as advance:
+            for (place, paths), module in zip(images.items(), modules, strict=True):
+                done, wrong = convert_images(paths, targets[place], module, advance)
+                before += done
+                failures.extend(wrong)
+        if len(failures) == count:
+            raise FileError(f"none of {count} images could be resampled: {failures[0]}")
         more = f" ({before} of them before)" if before else ""
         width, height = modules[0].new_camera.size
         out.print(f"{count - len(failures)} of {count} images rectified{more}, {width}x{height} px")
-    yield made, modules
+
+    yield resample if count else lambda *_: None
     print_wrote(folder, *extras)
     if failures:
         raise FileError(f"{len(failures)} of {count} images could not be resampled: {failures[0]}")
@@ -218,30 +212,22 @@ def _rectify_camera(source: str, images: list[str], folder: Path, options: ViewO
     camera_path = folder / f"{name}_rectified.json"
     extras = [*([] if options.cylinder else [camera_path]), *_extra_paths(folder, name, options)]
 
-    old = single_camera(source)
-
-    def make() -> tuple[Any, list[kcal.lens.Undistort]]:
-        fov, size = options.fov, options.size
+    old, fov, size = single_camera(source), options.fov, options.size
+    with _resampling(folder, sides, extras) as resample:
         if options.cylinder:
             view: Any = kcal.lens.cylinder_view(old, fov, size)
+        elif fov is None:
+            view = rooms.new_pinhole(old, options.alpha, size)
         else:
-            view = (
-                rooms.new_pinhole(old, options.alpha, size)
-                if fov is None
-                else kcal.lens.pinhole_view(fov, size or old.size)
-            )
-        return view, [
-            kcal.lens.Undistort(old, view, kcal.lens.looking(*look) if any(look) else None, at=options.distance)
-        ]
-
-    with _resampled(folder, sides, extras, make) as (view, (module,)):
-        if not options.cylinder:
-            kcal.save_camera(view, camera_path, name=f"{name} rectified")
+            view = kcal.lens.pinhole_view(fov, size or old.size)
+        module = kcal.lens.Undistort(old, view, kcal.lens.looking(*look) if any(look) else None, at=options.distance)
+        resample(module)
         _write_extras(folder, name, module, options)
         if options.cylinder:
             focal, cx, cy = view.params.tolist()
             out.print(f"cylinder: {focal:.2f} px a radian; straight ahead is {cx:.2f}, {cy:.2f}")
         else:
+            kcal.save_camera(view, camera_path, name=f"{name} rectified")
             fx, fy, cx, cy = view.params[:4].tolist()
             out.print(f"new camera: fx {fx:.2f}, fy {fy:.2f}, cx {cx:.2f}, cy {cy:.2f}")
         _tell_view(old, module, "")
@@ -255,19 +241,16 @@ def _rectify_rig(rig: kcal.Rig, images: list[str], folder: Path, options: ViewOp
     sides = {folder / name: rooms.expand_images([given]) for name, given in zip(names, images, strict=False)}
     rig_path, matrix_path = folder / "rectified.rig.json", folder / "Q.npy"
     extras = [rig_path, matrix_path, *(path for name in names for path in _extra_paths(folder, name, options))]
-
-    def make() -> tuple[kcal.lens.StereoRectification, list[kcal.lens.Undistort]]:
-        made = kcal.lens.StereoRectification(
+    with _resampling(folder, sides, extras) as resample:
+        both = kcal.lens.StereoRectification(
             rig, alpha=options.alpha, size=options.size, field_of_view=options.fov, at=options.distance
         )
-        return made, [made.left, made.right]
-
-    with _resampled(folder, sides, extras, make) as (both, modules):
+        resample(both.left, both.right)
         kcal.save_rig(kcal.Rig.pair(both.camera, both.camera, rooms.torch.eye(3), -both.right_center), rig_path)
         _save_array(matrix_path, both.depth_matrix)
         focal, _, cx, cy = both.camera.params[:4].tolist()
         out.print(f"both cameras: focal length {focal:.2f} px, cx {cx:.2f}, cy {cy:.2f}, baseline {rig.baseline:.6g} m")
-        for name, side in zip(names, modules, strict=True):
+        for name, side in zip(names, (both.left, both.right), strict=True):
             _write_extras(folder, name, side, options)
             _tell_view(side.camera, side, f"{name}: ")
         _tell_side(both)

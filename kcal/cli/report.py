@@ -378,9 +378,8 @@ def _all_refits(
     done = _kept_refits(path, key)[:count]
     if done:
         out.print(f"{len(done)} refits are done already ({path})", markup=False)
-    seen = {refit.seed for refit in done}
-    todo = [seed for seed in range(count) if seed not in seen]
-    saved, whole = time.monotonic(), True
+    todo = sorted({*range(count)} - {refit.seed for refit in done})
+    saved = time.monotonic()
     try:
         with steps("refits", count) as advance:
             advance("", len(done))
@@ -391,10 +390,10 @@ def _all_refits(
                     _keep_refits(path, key, done)
                     saved = time.monotonic()
     except KeyboardInterrupt:
-        whole = False
+        pass
     if todo and done:
         _keep_refits(path, key, done)
-    return done, whole
+    return done, len(done) == count
 
 
 def _keep_refits(path: Path, key: str, refits: list[rooms.Refit]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -132,16 +131,6 @@ def camera_names(paths: Sequence[Path], *, told_apart: bool = True) -> tuple[str
     return tuple(names)
 
 
-def _cure_of_sources(paths: Sequence[Path], sources: Sources, error: object) -> str:
-    """The command after a refusal of what a rig of two cameras was to be solved from."""
-    if len(paths) != 2:
-        return ""
-    if sources.pairs and sources.landmarks is None and isinstance(error, InputError):
-        return console.look_at_views(kcal.Observations.load(sources.pairs[0]), sources.pairs[0])
-    survey = sources.landmarks or "survey.csv"
-    return console.mark_again("--cameras", *paths, "--landmarks", survey, marks=sources.marks)
-
-
 def solve_and_write(
     paths: Sequence[Path],
     sources: Sources,
@@ -165,10 +154,12 @@ def solve_and_write(
     cameras = rig_sources.load_cameras(paths)
     if two:
         rig_sources.check_sides(cameras, paths)
-    with console.ending_with(functools.partial(_cure_of_sources, paths, sources)):
-        read = rig_sources.read_sources(cameras, sources, names)
-        with steps("solving the rig" if two else "solving the stations", None) as advance:
-            result = rooms.solve_surveyed(read.data, read.origin, options, advance)
+    read = rig_sources.read_sources(cameras, sources, names, paths)
+    with (
+        console.ending_with(lambda error: rig_sources.cure_of_all(error, sources, paths)),
+        steps("solving the rig" if two else "solving the stations", None) as advance,
+    ):
+        result = rooms.solve_surveyed(read.data, read.origin, options, advance)
     if not two:
         rig = result.stations(read.origin)
     else:

@@ -6,17 +6,18 @@ import dataclasses
 import functools
 import math
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import kcal
 from kcal.cli import kinds, rooms
-from kcal.cli.console import aligned, steps, warn
+from kcal.cli.console import aligned, ending_with, look_at_views, mark_again, steps, warn, with_command
 from kcal.cli.inputs import pixel_sigma_and_source, typed_with
 from kcal.cli.options import Kind, Rare, Several
 from kcal.cli.stars import Night
-from kcal.errors import InputError, KcalError
+from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.texts import measured_text
 from kcal.values import WithSigma, named, with_sigma
 
@@ -24,10 +25,6 @@ from kcal.values import WithSigma, named, with_sigma
 
 _REFRACTION_SIGMA = 0.1
 _REFRACTION = WithSigma(0.13, _REFRACTION_SIGMA)
-# Each of them alone is something to solve from.
-_SOURCES = (
-    "pairs", "landmarks", "marks", "features", "positions", "baseline", "stars", "scene", "terrain", "tracks",
-)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -110,7 +107,7 @@ class Sources:
     @property
     def given(self) -> bool:
         """Whether there is anything to solve a rig from."""
-        return any(getattr(self, name) for name in _SOURCES)
+        return any(getattr(self, name) for name in ("marks", *READERS))
 
 
 # Drones, ships and aircraft that tell where they are, for `kcal rig --tracks`.
@@ -558,11 +555,6 @@ def _add_landmarks(read: RigReading, path: Path) -> None:
     warn(*(f"{text}: {', '.join(some)}" for text, some in strays.items() if some))
 
 
-def _add_features(read: RigReading, path: Path) -> None:
-    """A table of points that several cameras see."""
-    read.add("features", kcal.rig.read_features(path, read.given.marks_sigma, read.names))
-
-
 def _add_pairs(read: RigReading, files: Sequence[Path]) -> None:
     """Boards that two cameras saw, or any of more."""
     if len(read.cameras) != 2:
@@ -583,9 +575,25 @@ def _add_pairs(read: RigReading, files: Sequence[Path]) -> None:
     read.unpaired = len(views[0]) + len(views[1]) - 2 * len(matched)
 
 
-def _add_baselines(read: RigReading, text: str) -> None:
-    """Measured distances between cameras."""
-    read.add("baselines", parse_baselines(text, tuple(read.cameras)))
+def _cure_of(option: str, sources: Sources, paths: Sequence[Path]) -> str:
+    """The command after a refusal of a source; none where the refusal says what to write."""
+    if option == "stars" and sources.stars:
+        words = ["kcal", "stars", sources.stars[0].rpartition("=")[2], "--camera", *map(str, paths[:1])]
+        return f"To see what each image shows: {shlex.join(words)}"
+    if len(paths) == 2 and option == "pairs" and sources.pairs:
+        return look_at_views(kcal.Observations.load(sources.pairs[0]), sources.pairs[0])
+    if len(paths) == 2 and option in ("landmarks", "marks", "features"):
+        marks = sources.marks or sources.features
+        return mark_again("--cameras", *paths, "--landmarks", sources.landmarks or "survey.csv", marks=marks)
+    return ""
+
+
+def cure_of_all(error: KcalError, sources: Sources, paths: Sequence[Path]) -> str:
+    """The command after a refusal of all sources together: another look at the only one, or more marks."""
+    if sources.pairs and sources.landmarks is None and isinstance(error, InputError):
+        return _cure_of("pairs", sources, paths)
+    marked = sources.marks or sources.features or isinstance(error, DegenerateError)
+    return _cure_of("marks", sources, paths) if marked else ""
 
 
 # What reads each option of `Sources`, in this order: later ones need the frame of the first.
@@ -595,17 +603,22 @@ READERS: dict[str, Callable[[RigReading, Any], None]] = {
     "pairs": _add_pairs,
     "stars": _add_stars,
     "terrain": _add_skyline,
-    "features": _add_features,
+    "features": lambda read, path: read.add(
+        "features", kcal.rig.read_features(path, read.given.marks_sigma, read.names)
+    ),
     "scene": _add_scene,
     "tracks": _add_tracks,
-    "baseline": _add_baselines,
+    "baseline": lambda read, text: read.add("baselines", parse_baselines(text, tuple(read.cameras))),
 }
 
 
-def read_sources(cameras: Sequence[kcal.Camera], sources: Sources, names: Sequence[str] = CAMERAS) -> RigReading:
+def read_sources(
+    cameras: Sequence[kcal.Camera], sources: Sources, names: Sequence[str] = CAMERAS, paths: Sequence[Path] = ()
+) -> RigReading:
     """Read everything; warnings about it are printed. Two cameras are left and right, one or more have their names."""
     if (sources.landmarks is None) != (sources.marks is None):
-        raise InputError("--landmarks and --marks belong together: places by name, and where they are in the images")
+        text = "--landmarks and --marks belong together: places by name, and where they are in the images"
+        raise InputError(with_command(text, _cure_of("marks", sources, paths)))
     if sources.terrain is None and (sources.skyline or sources.skyline_picture is not None):
         raise InputError("--skyline and --skyline-picture need the raster of the terrain: --terrain DEM.tif")
     known = CAMERAS if len(cameras) == 2 else names
@@ -615,7 +628,8 @@ def read_sources(cameras: Sequence[kcal.Camera], sources: Sources, names: Sequen
     )  # fmt: skip
     for option, reader in READERS.items():
         if value := getattr(sources, option):
-            reader(read, value)
+            with ending_with(lambda _, option=option: _cure_of(option, sources, paths)):
+                reader(read, value)
     return read
 
 

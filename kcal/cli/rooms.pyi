@@ -22,6 +22,7 @@ from kcal.calibrate.camera.trust import simulated_refits as simulated_refits
 from kcal.calibrate.camera.trust import stored_options as stored_options
 from kcal.calibrate.camera.trust import summarize as summarize
 from kcal.calibrate.hybrid.cameras_fit import fit_cameras as fit_cameras
+from kcal.calibrate.hybrid.measured_board import board_text as board_text
 from kcal.calibrate.rig.pairs import boards_of_several as boards_of_several
 from kcal.calibrate.rig.pairs import image_pairs as image_pairs
 from kcal.calibrate.rig.pairs import read_pairs as read_pairs
@@ -32,8 +33,8 @@ from kcal.capture.session import capture_app as capture_app
 from kcal.capture.session import follow as follow
 from kcal.capture.session import shots as shots
 from kcal.corners.detect import Detection as Detection
+from kcal.corners.detect import OtherBoardError as OtherBoardError
 from kcal.corners.detect import recognize_images as recognize_images
-from kcal.corners.detect import size_of as size_of
 from kcal.corners.foreign_corners import import_corners as import_corners
 from kcal.corners.images import Gray as Gray
 from kcal.corners.images import decode_image as decode_image
@@ -43,6 +44,7 @@ from kcal.corners.images import image_time as image_time
 from kcal.corners.images import is_video as is_video
 from kcal.corners.images import read_gray as read_gray
 from kcal.corners.images import turned_images as turned_images
+from kcal.corners.observations import SizesError as SizesError
 from kcal.corners.observations import nearly as nearly
 from kcal.corners.observations import resized_alike as resized_alike
 from kcal.corners.print_board import board_sheet as board_sheet
@@ -123,7 +125,6 @@ from kcal.pipeline.video_source import FramesTogether as FramesTogether
 from kcal.pipeline.video_source import Videos as Videos
 from kcal.report.calibration import FailedImage as FailedImage
 from kcal.report.calibration import board_figure as board_figure
-from kcal.report.calibration import board_text as board_text
 from kcal.report.calibration import coverage_figure as coverage_figure
 from kcal.report.calibration import difference_figure as difference_figure
 from kcal.report.calibration import gallery_figure as gallery_figure

@@ -49,7 +49,7 @@ from kcal.corners.saddle import CornerStatus, Refined
 from kcal.corners.search import NotFoundError, find_board, refine_through_sizes, search_sizes
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.errors import FileError, InputError
-from kcal.files import source_name
+from kcal.files import read_head, source_name
 from kcal.opencv import cv2
 from kcal.texts import briefly
 
@@ -151,9 +151,23 @@ def _detect_circles(image: Gray, board: Board, refine: Refinement) -> Detection:
 _OTHER = re.compile(r"a (?:board|grid) of (\d+)x(\d+) inner corners was found")
 _LOOKS = 3  # images without the board in which another one is sought
 _STOPS = 3, 8  # images without the board, and none with it, after which the search may end
+_HEAD = 1 << 17  # bytes of an image that mostly tell its size
 _CHECKED = 6  # images without the board, where less than half have it, in which another one is sought
 _LOOKED_AT = 24  # images that tell which board they show
 _FEW = 0.2  # views, as a share of the images that show one other board: the board was named wrongly
+
+
+class OtherBoardError(InputError):
+    """Images show another board than the one that was asked for.
+
+    Args:
+        text: the message.
+        images: those without that board, far apart from each other first.
+    """
+
+    def __init__(self, text: str, images: Sequence[Any] = ()) -> None:
+        super().__init__(text)
+        self.images = images
 
 
 def seen_by_most(failed: Sequence[tuple[Any, str]], board: Board) -> tuple[str, int]:
@@ -189,20 +203,23 @@ def refuse_other_board(views: int, failed: Sequence[tuple[Any, str]], count: int
         least: images that must show one other board where none shows this one.
 
     Raises:
-        InputError: so it is; with what most images show.
+        InputError: so it is; an `OtherBoardError` with what most images show.
     """
     where = f"any of {count} images" if len(failed) == count else f"the first {len(failed)} of {count} images"
+    images = [failed[number][0] for number in spread_order(len(failed))]
     if not views:
         text, shown = seen_by_most(failed, board)
         if shown < least:
             return
-        raise InputError(f"no board in {where} ({f'{shown} of them: {text}' if text else failed[0][1]})")
+        if not text:
+            raise InputError(f"no board in {where} ({failed[0][1]})")
+        raise OtherBoardError(f"no board in {where} ({shown} of them: {text})", images)
     if views <= _FEW * sum(bool(_OTHER.search(reason)) for _, reason in failed):
         text, shown = seen_by_most(failed, board)
         if views <= _FEW * shown:
-            raise InputError(f"the board is in {views} of {count} images only; in {shown} of them {text}")
+            raise OtherBoardError(f"the board is in {views} of {count} images only; in {shown} of them {text}", images)
     if 2 * views < count:
-        found = recognize_images([failed[number][0] for number in spread_order(len(failed))], _CHECKED)
+        found = recognize_images(images, _CHECKED)
         others = found.votes * len(failed) / max(found.looked, 1)
         # A part of the board does not end in one image and have the same size in others.
         if (
@@ -212,9 +229,10 @@ def refuse_other_board(views: int, failed: Sequence[tuple[Any, str]], count: int
             and found.votes > 1
             and others > views
         ):
-            raise InputError(
+            raise OtherBoardError(
                 f"the board is in {views} of {count} images only; in {found.votes} of {found.looked} others that were "
-                f"looked at another one is seen: give --board {found.seen.text}"
+                f"looked at another one is seen: give --board {found.seen.text}",
+                images,
             )
 
 
@@ -572,7 +590,10 @@ def size_of(file: Any) -> tuple[int, int] | None:
     if not isinstance(file, Path):
         return _size(file)
     try:
-        width, height = image_header(image_bytes(file), file)
+        try:
+            width, height = image_header(read_head(file, _HEAD), file)
+        except FileError:
+            width, height = image_header(image_bytes(file), file)
         return (width, height) if width else _size(image_and_hash(file)[0])
     except FileError:
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -230,6 +230,19 @@ class CommonSize(NamedTuple):
     notes: tuple[str, ...]
 
 
+class SizesError(InputError):
+    """Images of different sizes, of which none has more than half.
+
+    Args:
+        text: the message.
+        groups: numbers of the images of each size.
+    """
+
+    def __init__(self, text: str, groups: Mapping[Size, Sequence[int]] | None = None) -> None:
+        super().__init__(text)
+        self.groups = groups or {}
+
+
 def common_size(names: Sequence[str], sizes: Sequence[Size | None]) -> CommonSize:
     """Find the size of most images, how others must be scaled to have it, and which ones cannot.
 
@@ -240,7 +253,7 @@ def common_size(names: Sequence[str], sizes: Sequence[Size | None]) -> CommonSiz
         sizes: (width, height) of each; None for what is no image.
 
     Raises:
-        InputError: no size to which more than half of the images belong.
+        SizesError: no size to which more than half of the images belong.
 
     Example:
         >>> found = common_size(["a", "b", "c", "d"], [(1920, 1080), (640, 360), (1920, 1080), (640, 480)])
@@ -269,9 +282,10 @@ def common_size(names: Sequence[str], sizes: Sequence[Size | None]) -> CommonSiz
             f"{len(groups[w, h])} of {w}x{h} px ({_named(names, groups[w, h])})" for w, h in (most, *others)
         )
         cure = "turn back those that were turned by 90 degrees, or " if turned else ""
-        raise InputError(
+        raise SizesError(
             f"images of different sizes, of which none has more than half: {counts}; {cure}detect those of each size "
-            "apart, as those of a camera of its own"
+            "apart, as those of a camera of its own",
+            groups,
         )
     notes = [
         f"images of {w}x{h} px were taken as they are among the {shown}; which edge has more pixels is not known: "

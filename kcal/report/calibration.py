@@ -24,13 +24,13 @@ from kcal.calibrate.camera.at_setting import ComparisonResult
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.calibrate.camera.export import Misfit
 from kcal.calibrate.camera.trust import IntervalCheck
-from kcal.calibrate.hybrid.measured_board import Measured, MeasuredBoard
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard, board_text
 from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View
 from kcal.errors import FileError
 from kcal.lens.difference import CameraDifference, difference_text
 from kcal.lens.uncertainty import image_sigma
-from kcal.texts import measured_text, number_text, percent_text
+from kcal.texts import percent_text
 from kcal.threads import in_one_thread
 
 # Draw a calibration: where the board was seen, the residuals, and the RMS of each view.
@@ -196,22 +196,6 @@ def draw_view_rms(axes: Axes, result: CameraCalibrationResult) -> None:
 _ACROSS = 160
 # What is below this (mm) is not worth full colors and long arrows.
 _LEAST = 0.01
-
-
-def board_text(board: MeasuredBoard) -> list[str]:
-    """Bending, stretch, shear and print error with their standard deviations, one line each."""
-
-    def text(found: Measured, scale: float, unit: str) -> str:
-        return measured_text(scale * found.value, scale * found.sigma, unit)
-
-    single = f"single corners {number_text(1e3 * board.corner_error)} mm RMS, beside all this"
-    return [
-        f"bending {text(board.bending, 1e3, 'mm')} (height over the best plane, at most)",
-        f"stretch {text(board.stretch, 100.0, '%')} (width over height)",
-        f"shear {text(board.shear, 100.0, '%')}",
-        f"print error {text(board.print_error, 1e3, 'mm')} RMS, beyond stretch and shear",
-        *([single] if board.corner_error else []),
-    ]
 
 
 def board_figure(board: MeasuredBoard, ax: Axes | None = None) -> Figure:

@@ -549,6 +549,9 @@ def refusal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("calibrate a/left.obs.json b/left.obs.json -o x", "both named left", "mv b/left.obs.json b/b-left.obs.json"),
         (f"{RIG} --landmarks survey.csv", "belong together", f"{MARK} --cameras left.camera.json"),
         (f"{RIG} --landmarks survey.csv --marks marks.csv", "left", f"{MARK} --cameras left.camera.json"),
+        (f"{RIG} --baseline 10.02", "baseline", "10.02±0.005"),
+        (f"{RIG} --positions survey.csv", "positions", "left, right"),
+        (f"{RIG} --stars blank.png board.png", "--stars", "kcal stars blank.png --camera left.camera.json"),
         (f"{PAIRS} a/left.obs.json other.obs.json", "different boards", f"{SEEN} a/left.obs.json"),
         (f"{PAIRS} a/left.obs.json named.obs.json", "v00", f"{SEEN} a/left.obs.json"),
         (f"{TWICE} a/left.obs.json b/left.obs.json", "the same camera", f"{SEEN} a/left.obs.json"),
@@ -575,6 +578,7 @@ def test_it_ends_with_a_command(
     assert named in said
     assert cure in said
     assert not list(refusal_folder.glob("x.*"))
+    assert ("kcal " in said) == cure.startswith("kcal ")
     if cure.startswith("kcal "):
         # Its options and arguments are those of the command.
         name, *words = shlex.split(said[said.rindex("kcal ") :])[1:]

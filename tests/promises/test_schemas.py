@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from kcal import Observations, load_camera, load_rig, save_camera, save_rig
 from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
-from kcal.cli.exchange import FILES, file_schema
+from kcal.cli.cameras import FILES, file_schema
 from kcal.cli.main import app
 
 STORED = Path(__file__).parent / "files"

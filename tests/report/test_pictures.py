@@ -20,13 +20,12 @@ from kcal import Board, Camera, InputError, Observations, View
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.export import Misfit
-from kcal.calibrate.hybrid.measured_board import MeasuredBoard
+from kcal.calibrate.hybrid.measured_board import MeasuredBoard, board_text
 from kcal.lens import camera_difference
 from kcal.locate.siting import siting_map
 from kcal.report import rig_figure, save_picture
 from kcal.report.calibration import (
     board_figure,
-    board_text,
     calibration_figure,
     coverage_figure,
     difference_figure,

@@ -20,7 +20,7 @@ from kcal.errors import InputError
 from kcal.gaussian import Gaussian, numbered, stacked
 from kcal.lens.information import BOARD_SLOT, CameraInformation
 from kcal.native_file import NativeFile
-from kcal.texts import brief
+from kcal.texts import brief, measured_text, number_text
 
 # What is known of a board, as Gaussians over the amplitudes of its modes: as printed, and what cameras tell of it.
 #
@@ -264,6 +264,22 @@ class MeasuredBoard:
         return fitted, rest if places is None else rest[..., count:]
 
     __repr__ = brief
+
+
+def board_text(board: MeasuredBoard) -> list[str]:
+    """Bending, stretch, shear and print error with their standard deviations, one line each."""
+
+    def text(found: Measured, scale: float, unit: str) -> str:
+        return measured_text(scale * found.value, scale * found.sigma, unit)
+
+    single = f"single corners {number_text(1e3 * board.corner_error)} mm RMS, beside all this"
+    return [
+        f"bending {text(board.bending, 1e3, 'mm')} (height over the best plane, at most)",
+        f"stretch {text(board.stretch, 100.0, '%')} (width over height)",
+        f"shear {text(board.shear, 100.0, '%')}",
+        f"print error {text(board.print_error, 1e3, 'mm')} RMS, beyond stretch and shear",
+        *([single] if board.corner_error else []),
+    ]
 
 
 class BoardFile(NativeFile):
