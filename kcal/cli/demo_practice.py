@@ -85,14 +85,10 @@ def _template(name: str) -> str:
 
 def survey_text(scene: rooms.DemoScene) -> str:
     """The landmarks as a surveyor hands them over: latitude, longitude, ellipsoidal height, sigma in meters."""
-    origin = kcal.Origin(lat=scene.lat, lon=scene.lon, height=scene.height)
-    surveyed = scene.surveyed(scene.landmarks)
-    lines = ["name,lat,lon,height,sigma"]
-    for name, (lat, lon, height) in zip(
-        surveyed.names, kcal.locate.enu_to_geodetic(surveyed.enu, origin).tolist(), strict=True
-    ):
-        lines.append(f"{name},{lat:.9f},{lon:.9f},{height:.3f},{scene.survey_sigma:g}")
-    return "\n".join(lines) + "\n"
+    origin, surveyed = kcal.Origin(lat=scene.lat, lon=scene.lon, height=scene.height), scene.surveyed(scene.landmarks)
+    places = zip(surveyed.names, kcal.locate.enu_to_geodetic(surveyed.enu, origin).tolist(), strict=True)
+    lines = [f"{name},{lat:.9f},{lon:.9f},{height:.3f},{scene.survey_sigma:g}\n" for name, (lat, lon, height) in places]
+    return "".join(["name,lat,lon,height,sigma\n", *lines])
 
 
 def targets_text() -> str:
@@ -127,7 +123,8 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
     check_folder(folder, seed)
     scene = practice.practice_scene(seed, views, scale)
     site = practice.PracticeSite(scene)
-    parts = list(_practice_parts(site, frames))
+    said = ""
+    parts = list(_practice_parts(site, frames, lambda: advance(said)))
     missing = [(path, work, write) for path, work, write in parts if not (folder / path).exists()]
     done = 0
     with steps("rendering", sum(work for _, work, _ in missing) or None) as advance:
@@ -136,7 +133,7 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
             said = f"{path}"
             advance(said, 0)
             try:
-                write(folder / path, functools.partial(advance, said))
+                write(folder / path)
             except ImportError as error:
                 extra = _EXTRAS.get(error.name or "", "video")
                 cure = f"pip install 'kcal[{extra}]', and run this again"
@@ -176,14 +173,22 @@ def read_truth_file(folder: Path) -> dict[str, Any]:
     return content
 
 
-_Write = Callable[[Path, Callable[[], None]], object]
+_Write = Callable[[Path], object]
 
 
-def _practice_parts(site: practice.PracticeSite, frames: int) -> Iterator[tuple[Path, int, _Write]]:
-    """Each file with the steps of its bar, and what writes it; the truth first, which says whose folder it is."""
+def _practice_parts(
+    site: practice.PracticeSite, frames: int, step: Callable[[], None]
+) -> Iterator[tuple[Path, int, _Write]]:
+    """Each file with the steps of its bar, and what writes it; the truth first, which says whose folder it is.
+
+    Of a film each frame is a step that it takes itself.
+    """
 
     def text(make: Callable[[], str]) -> _Write:
-        return lambda path, _: write_atomic(path, make())
+        return lambda path: write_atomic(path, make())
+
+    def image(make: Callable[..., NDArray[np.uint8]], *given: Any) -> _Write:
+        return lambda path: rooms.write_png(path, make(*given))
 
     yield TRUTH, 1, text(lambda: dump_json(practice.practice_truth(site, frames)))
     yield Path("README.txt"), 1, text(lambda: readme_text(site.scene))
@@ -191,34 +196,29 @@ def _practice_parts(site: practice.PracticeSite, frames: int) -> Iterator[tuple[
     yield Path("targets.csv"), 1, text(targets_text)
     yield Path("find_ships.py"), 1, text(lambda: _template("find_ships.txt"))
     for index, (side, name, pose) in enumerate(rooms.scene_views(site.scene)):
-        write = functools.partial(_board, site.scene, index, side, pose)
-        yield Path("boards", side, f"{name.removeprefix('near-')}.png"), _BOARD_STEPS, write
-    for side in practice.SIDES:
-        yield Path("site", f"{side}.png"), _PICTURE_STEPS, functools.partial(_picture, site, side)
-    yield from ((Path("night", night_name(side)), 1, functools.partial(_night, site, side)) for side in practice.SIDES)
+        path = Path("boards", side, f"{name.removeprefix('near-')}.png")
+        yield path, _BOARD_STEPS, image(_board, site.scene, index, side, pose)
+    yield from ((Path("site", f"{side}.png"), _PICTURE_STEPS, image(site.picture, side)) for side in practice.SIDES)
+    yield from ((Path("night", night_name(side)), 1, image(_night, site, side)) for side in practice.SIDES)
     yield Path("site", "sketch.png"), 1, functools.partial(_sketch, site)
     yield Path("video", "detections.jsonl"), 1, text(lambda: _detections(site, frames))
     for side in practice.SIDES:
-        yield Path("video", f"{side}.mp4"), frames, functools.partial(_film, site, side, frames)
+        yield Path("video", f"{side}.mp4"), frames, functools.partial(_film, site, side, frames, step)
 
 
-def _board(scene: rooms.DemoScene, index: int, side: str, pose: Any, path: Path, _: Callable[[], None]) -> None:
-    image = rooms.render_board(getattr(scene.rig, side), pose, scene.near_board, scene.render, scene.generator(index))
-    rooms.write_png(path, image.numpy())
+def _board(scene: rooms.DemoScene, index: int, side: str, pose: Any) -> NDArray[np.uint8]:
+    camera, noise = getattr(scene.rig, side), scene.generator(index)
+    return rooms.render_board(camera, pose, scene.near_board, scene.render, noise).numpy()
 
 
-def _picture(site: practice.PracticeSite, side: practice.Side, path: Path, _: Callable[[], None]) -> None:
-    rooms.write_png(path, site.picture(side))
-
-
-def _night(site: practice.PracticeSite, side: practice.Side, path: Path, _: Callable[[], None]) -> None:
+def _night(site: practice.PracticeSite, side: practice.Side) -> NDArray[np.uint8]:
     importlib.import_module("erfa")
     scene, catalog = site.scene, kcal.stars.StarCatalog.bundled()
     view = kcal.stars.SkyView(time=NIGHT, origin=kcal.Origin(lat=scene.lat, lon=scene.lon, height=scene.height))
-    rooms.write_png(path, practice.night_picture(site, side, view.directions(catalog), catalog.magnitude))
+    return practice.night_picture(site, side, view.directions(catalog), catalog.magnitude)
 
 
-def _sketch(site: practice.PracticeSite, path: Path, _: Callable[[], None]) -> None:
+def _sketch(site: practice.PracticeSite, path: Path) -> None:
     scene = site.scene
     groups = [
         ([thing.name for thing in things], site.true_pixels("left", points.enu))
@@ -227,7 +227,7 @@ def _sketch(site: practice.PracticeSite, path: Path, _: Callable[[], None]) -> N
     rooms.save_site_sketch(path, site.picture("left", noise=0.0), *groups)
 
 
-def _film(site: practice.PracticeSite, side: practice.Side, count: int, path: Path, step: Callable[[], None]) -> None:
+def _film(site: practice.PracticeSite, side: practice.Side, count: int, step: Callable[[], None], path: Path) -> None:
     def told() -> Iterator[NDArray[np.uint8]]:
         for frame in practice.frames(site, side, count):
             yield frame
