@@ -575,7 +575,7 @@ def _add_pairs(read: RigReading, files: Sequence[Path]) -> None:
     read.unpaired = len(views[0]) + len(views[1]) - 2 * len(matched)
 
 
-def _cure_of(option: str, sources: Sources, paths: Sequence[Path]) -> str:
+def _cure_of(option: str, sources: Sources, paths: Sequence[Path], _: object = None) -> str:
     """The command after a refusal of a source; none where the refusal says what to write."""
     if option == "stars" and sources.stars:
         words = ["kcal", "stars", sources.stars[0].rpartition("=")[2], "--camera", *map(str, paths[:1])]
@@ -628,7 +628,7 @@ def read_sources(
     )  # fmt: skip
     for option, reader in READERS.items():
         if value := getattr(sources, option):
-            with ending_with(lambda _, option=option: _cure_of(option, sources, paths)):
+            with ending_with(functools.partial(_cure_of, option, sources, paths)):
                 reader(read, value)
     return read
 

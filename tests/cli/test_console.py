@@ -537,6 +537,10 @@ def refusal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     cv2.imwrite(str(here / "board.png"), image)
     cv2.imwrite(str(here / "blank.png"), np.full((480, 640), 128, np.uint8))
+    page = np.full((480, 640), 240, np.uint8)
+    for number in range(42):
+        cv2.circle(page, (120 + 65 * (number % 7), 80 + 65 * (number // 7)), 18, 20, -1, cv2.LINE_AA)
+    cv2.imwrite(str(here / "circles.png"), page)
     return here
 
 
@@ -557,6 +561,11 @@ def refusal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (f"{TWICE} a/left.obs.json b/left.obs.json", "the same camera", f"{SEEN} a/left.obs.json"),
         ("locate placeless.json far.csv --site 0,0,0 --heading 0", "far.csv", f"{MARK} --rig placeless.json"),
         ("detect board.png --board 9x6 --square 25mm -o x.json", "7x6", "kcal detect board.png --board 7x6 --square"),
+        (
+            "detect circles.png --board circles:8x6 --square 25mm -o x.json",
+            "42 circles",
+            "kcal detect circles.png --board circles:7x6",
+        ),
         ("detect blank.png --board 9x6 --square 25mm -o x.json", "blank.png", "kcal board --board 9x6 --square 25mm"),
     ],
 )

@@ -64,6 +64,13 @@ def test_failures_are_listed_on_screen_and_in_the_file(shots, tmp_path):
     assert [failure.name for failure in Observations.load(output).failures] == ["bad.jpg"]
 
 
+def test_each_image_is_read_once(shots, monkeypatch):
+    read, whole = [], module.image_bytes
+    monkeypatch.setattr(module, "image_bytes", lambda path: read.append(path) or whole(path))
+    assert len(detect(shots, SMALL).views) == 2
+    assert sorted(read) == sorted(shots.iterdir())
+
+
 def test_sixteen_bit_images(shots, tmp_path):
     for path in shots.iterdir():
         cv2.imwrite(str(path), cv2.imread(str(path), 0).astype(np.uint16) * 257)
