@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -142,9 +140,3 @@ def test_nothing_located_is_a_failure_with_its_reasons(folder: Path, command: Co
 )
 def test_refusals_are_one_line_and_write_nothing(folder: Path, command: Command, arguments: str, message: str) -> None:
     assert message in command.refuses("locate", arguments)
-
-
-def test_help_needs_no_heavy_imports() -> None:
-    code = "import sys, kcal.cli.main; print([m for m in ('torch', 'matplotlib', 'pyproj') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
