@@ -77,9 +77,9 @@ def test_a_function_makes_each_table(page: Path) -> None:
 
 # Sections that take few seconds in little, without other programs and without an installation; `make pages` runs all.
 IN_LITTLE = (
-    "corners refinement", "lens accuracy", "lens no ray", "lens lookup tables", "lens inverse nets", "locate accuracy",
+    "lens accuracy", "lens no ray", "lens lookup tables", "lens inverse nets", "locate accuracy",
     "locate coverage", "locate localizer", "moving moving", "mutants mutants", "ordinary aspect",
-    "other-programs devices", "paper eq 12", "paper table 2", "precision limits", "precision lens precision",
+    "other-programs devices", "paper table 2", "precision limits", "precision lens precision",
     "rig contradictions", "rig coverage", "rig turned", "rig faults", "solver first-order methods",
     "solver predicted and repeated", "stars random", "stations coverage", "stations peers", "stations smoke",
     "stations two", "tracks station tracks", "tracks station speed", "watch drift", "watch swing",
