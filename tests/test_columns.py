@@ -12,7 +12,7 @@ import pytest
 from kcal.calibrate.batch.jobs import _COLUMNS
 from kcal.calibrate.batch.results import SummaryRow
 from kcal.locate.marks import COVARIANCE, PIXELS
-from kcal.locate.survey import FEATURE_COLUMNS, PLACE_COLUMNS
+from kcal.locate.survey import PLACE_COLUMNS, RANGES
 from kcal.locate.tables import NUMBERS, TEXTS
 from kcal.pipeline.stream import track_columns
 from kcal.texts import length_text, length_unit, measured_length, measured_text, number_text, range_text
@@ -40,7 +40,7 @@ def tables(section: str) -> list[list[str]]:
 def test_marks_and_features() -> None:
     marks, features = tables("Marks")
     assert sorted(marks) == sorted(("name", *PIXELS, *COVARIANCE, "note"))
-    assert sorted(features) == sorted(set(FEATURE_COLUMNS) - set(marks))
+    assert sorted(features) == sorted(RANGES)
 
 
 def test_places() -> None:

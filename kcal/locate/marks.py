@@ -139,12 +139,6 @@ def is_long(path: str | Path) -> bool:
     return "camera" in header_of(path)
 
 
-def refuse_wide(path: str | Path, cameras: Sequence[str]) -> None:
-    """Raise `FileError` unless a wide table suits the cameras: it is of two."""
-    if len(cameras) != 2:
-        raise FileError(f"{path}: marks of {len(cameras)} cameras need the columns {','.join(_LONG)}, one line each")
-
-
 def read_marks(
     path: str | Path,
     cameras: Sequence[str] = PAIR,
@@ -169,7 +163,7 @@ def read_marks(
         cameras: their names, in the order of the result.
         single: allow a point of two cameras to be marked in one image only; the other's two cells are then empty.
         others: skip marks of other cameras, where they are otherwise an error.
-        more: the other columns that a long table may have; any if left out.
+        more: the other columns that a table may have, which `extras` contains; any of a long one if left out.
 
     Raises:
         FileError: the file cannot be read, has no rows, an unknown or missing column, or a line with a wrong number
@@ -191,7 +185,7 @@ def read_marks(
     """
     if is_long(path):
         return _whole_long(path, cameras, others, more)
-    found = [marks for marks, _ in _wide_chunks(path, cameras, single, False, CHUNK_ROWS)]
+    found = [marks for marks, _ in _wide_chunks(path, cameras, single, False, CHUNK_ROWS, more or ())]
     names = tuple(name for marks in found for name in marks.names)
     covariance = None
     if any(marks.covariance is not None for marks in found):
@@ -200,7 +194,10 @@ def read_marks(
             unknown.expand(len(marks.names), 4, 4) if marks.covariance is None else marks.covariance for marks in found
         ]
         covariance = torch.cat(parts)
-    return Marks(names, torch.cat([marks.pixels for marks in found]), covariance)
+    extras = {
+        name: [cell for marks in found for cell in marks.extras[name]] for name in more or () if name in found[0].extras
+    }
+    return Marks(names, torch.cat([marks.pixels for marks in found]), covariance, None, extras)
 
 
 def read_mark_chunks(
@@ -252,11 +249,12 @@ def read_mark_chunks(
 
 
 def _wide_chunks(
-    path: str | Path, cameras: Sequence[str], single: bool, extras: bool, at_once: int
+    path: str | Path, cameras: Sequence[str], single: bool, extras: bool, at_once: int, more: Sequence[str] = ()
 ) -> Iterator[tuple[Marks, int]]:
-    refuse_wide(path, cameras)
+    if len(cameras) != 2:
+        raise FileError(f"{path}: marks of {len(cameras)} cameras need the columns {','.join(_LONG)}, one line each")
     known = (*_WIDE, *COVARIANCE)
-    for chunk in read_chunks(path, ",".join(_WIDE), (*known, "note"), PIXELS, extras=extras, at_once=at_once):
+    for chunk in read_chunks(path, ",".join(_WIDE), (*known, "note", *more), PIXELS, extras=extras, at_once=at_once):
         values = chunk.numbers(PIXELS)
         if values is None:
             values = np.array([[pixel_of(row, side, single) for side in PAIR] for row in chunk.rows()])
@@ -273,7 +271,7 @@ def _whole_long(
     for chunk in _long_chunks(path, more):
         columns = [column for column in chunk.columns if column not in _KNOWN]
         for row in chunk.rows():
-            reader.add(row)
+            reader.add(row, more or ())
     if not reader.first:
         raise FileError(f"{path}: no mark of {', '.join(cameras)}; the column camera needs its file's name")
     return reader.marks(columns)
@@ -317,7 +315,8 @@ class _Gather:
         self.placed: dict[tuple[int, int], tuple[float, float, float]] = {}
         self.first: list[TableRow] = []
 
-    def add(self, row: TableRow) -> None:
+    def add(self, row: TableRow, stated: Sequence[str] = ()) -> None:
+        """Take one line; what it states of its point may stand in any of the point's lines."""
         camera = row.cells["camera"]
         if camera not in self.number:
             if self.others:
@@ -327,6 +326,12 @@ class _Gather:
         place = self.rows.setdefault(key, len(self.rows)), self.number[camera]
         if place[0] == len(self.first):
             self.first.append(row)
+        first = self.first[place[0]].cells
+        for column in set(stated) & set(first):
+            earlier, cell = first[column], row.cells[column]
+            if cell and earlier not in ("", cell):
+                raise FileError(f"{row.where}: {column} of {row.name!r} is {cell}, and {earlier} in an earlier line")
+            first[column] = earlier or cell
         if place in self.placed:
             raise FileError(f"{row.where}: {row.name!r} was marked in {camera} before; one mark each is needed")
         sigma = row.positive("sigma") or math.nan

@@ -18,13 +18,14 @@ from kcal.calibrate.rig.marks import Features, Landmarks, inverse_range_beyond
 from kcal.calibrate.rig.resection import consensus_pose
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
+from kcal.calibrate.rig.source import require_positive
 from kcal.calibrate.rig.sources import MeasuredPosition, RigData
 from kcal.errors import FileError, InputError, KcalError
 from kcal.files import read_text
 from kcal.finding import Finding
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
-from kcal.locate.marks import PAIR, PIXELS, Marks, is_long, pixel_of, read_marks, refuse_wide
+from kcal.locate.marks import PAIR, Marks, read_marks
 from kcal.locate.mounting import attitude
 from kcal.locate.tables import TableRow, guarded, read_rows
 from kcal.strict_json import MOST_BYTES, read_json, read_xml
@@ -39,7 +40,6 @@ from kcal.texts import briefly, csv_line, length_text
 
 EARTH, LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
 RANGES = ("range", "range_sigma", "beyond")
-FEATURE_COLUMNS = ("name", *PIXELS, *RANGES, "note")
 PLACE_COLUMNS = ("name", *EARTH, *LOCAL, "sigma", "sigma_up", "note")
 # Degrees: places of one table that lie together, and one that does not.
 _TOGETHER, _APART = 0.5, 1.0
@@ -87,9 +87,14 @@ def read_survey(path: str | Path, origin: Origin | None = None, *, measured: boo
         >>> [round(value, 2) for value in survey.points[1].tolist()]  # across the antimeridian
         [1001.88, 0.0, 9.92]
     """
-    rows = read_rows(path, "name,lat,lon,height,sigma", PLACE_COLUMNS, ("sigma",) if measured else ())
+    return _read_csv(path, origin, None if measured else 0.0)
+
+
+def _read_csv(path: str | Path, origin: Origin | None, otherwise: float | None) -> Survey:
+    """`read_survey`, with a sigma for places that state none; None: they are refused."""
+    rows = read_rows(path, "name,lat,lon,height,sigma", PLACE_COLUMNS, ("sigma",) if otherwise is None else ())
     values, origin = places_of(rows, path, origin)
-    sigma = [place_sigma(row, "place") if measured or row.cells.get("sigma") else (0.0, 0.0, 0.0) for row in rows]
+    sigma = [place_sigma(row, "place", otherwise) for row in rows]
     return Survey(tuple(row.name for row in rows), values, torch.tensor(sigma, dtype=torch.float64), origin)
 
 
@@ -149,9 +154,10 @@ def _coordinates(row: TableRow, path: str | Path) -> tuple[str, str, str]:
     raise FileError(f"{path}: the columns lat, lon, height or east, north, up are needed")
 
 
-def place_sigma(row: TableRow, what: str) -> tuple[float, float, float]:
-    """How well a place or fix is known along each axis, meters: the cells sigma and, if it is there, sigma_up."""
+def place_sigma(row: TableRow, what: str, otherwise: float | None = None) -> tuple[float, float, float]:
+    """How well a place or fix is known along each axis, meters: the cells sigma (or `otherwise`) and sigma_up."""
     level = row.positive("sigma", infinite=True)
+    level = otherwise if level is None else level
     if level is None or math.isinf(level):
         raise FileError(f"{row.where}: sigma is empty; write how well the {what} is known, meters")
     up = row.positive("sigma_up") or level
@@ -213,7 +219,7 @@ def read_features(path: str | Path, pixel_sigma: float, cameras: Sequence[str] =
 
     Args:
         path: of the table, in either layout of `read_marks`.
-        pixel_sigma: of a mark along an axis, px.
+        pixel_sigma: of a mark along an axis, px, where the table states none.
         cameras: their names, where each mark has a line.
 
     Raises:
@@ -227,25 +233,18 @@ def read_features(path: str | Path, pixel_sigma: float, cameras: Sequence[str] =
         ...     read_features(path, 0.1).inverse_range.tolist()
         [2.5e-05, 0.0]
     """
-    if is_long(path):
-        marks = read_marks(path, cameras, more=RANGES)
-        rows = [
-            TableRow(f"{path}: {name}", name, {column: cells[i] for column, cells in marks.extras.items()})
-            for i, name in enumerate(marks.names)
-        ]
-        pixels = marks.pixels
-    else:
-        refuse_wide(path, cameras)
-        rows = read_rows(path, "name,left_u,left_v,right_u,right_v,range,range_sigma", FEATURE_COLUMNS, PIXELS)
-        both = [[pixel_of(row, side, False) for side in PAIR] for row in rows]
-        pixels = torch.tensor(both, dtype=torch.float64)
+    marks = read_marks(path, cameras, more=RANGES)
+    rows = [
+        TableRow(f"{path}: {name}", name, {column: cells[i] for column, cells in marks.extras.items()})
+        for i, name in enumerate(marks.names)
+    ]
     known = torch.tensor([inverse_range_of(row) for row in rows], dtype=torch.float64).reshape(-1, 2)
     return Features(
-        names=tuple(row.name for row in rows),
-        pixels=pixels,
+        names=tuple(marks.names),
+        pixels=marks.pixels,
         inverse_range=known[:, 0],
         inverse_range_sigma=known[:, 1],
-        pixel_sigma=pixel_sigma,
+        pixel_sigma=marks.sigmas(pixel_sigma),
     )
 
 
@@ -327,10 +326,12 @@ def import_survey(
     """
     path = Path(path)
     suffix = path.suffix.lower()
+    if sigma is not None:
+        require_positive("sigma", sigma)
     if geoid is not None and suffix != ".gpx":
         raise InputError(f"{path}: heights are ellipsoidal there; a geoid's height is added to those of GPX only")
     if suffix not in (".geojson", ".json", ".gpx"):
-        return read_survey(path, origin)
+        return _read_csv(path, origin, sigma)
     if suffix == ".gpx" and geoid is None:
         raise InputError(
             f"{path}: elevations of GPX are above sea level; give the geoid's height there (0 if they are ellipsoidal)"

@@ -76,7 +76,7 @@ class CameraTurns(NamedTuple):
 
 
 def camera_turns(
-    cameras: Sequence[Camera], names: Sequence[str], then: Tensor, now: Tensor, sigma: float
+    cameras: Sequence[Camera], names: Sequence[str], then: Tensor, now: Tensor, sigma: Tensor | float
 ) -> CameraTurns:
     """Find how each camera has turned; features that moved are left out.
 
@@ -85,13 +85,14 @@ def camera_turns(
         names: of the cameras.
         then: (F, C, 2) marks in all cameras; NaN where there is none.
         now: (F, C, 2) likewise.
-        sigma: of the difference between two marks along an axis, px.
+        sigma: of the difference between two marks along an axis, px; one number, or (F, C).
 
     Raises:
         InputError: many features moved.
         DegenerateError: a camera has fewer than two features with marks then and now, or all in one place.
     """
-    views = [_MarksTwice(camera, then[:, c], now[:, c]) for c, camera in enumerate(cameras)]
+    sigmas = torch.as_tensor(sigma, dtype=torch.float64).expand(then.shape[:2]).nan_to_num(1.0)
+    views = [_MarksTwice(camera, then[:, c], now[:, c], sigmas[:, c, None]) for c, camera in enumerate(cameras)]
     known = torch.stack([view.known for view in views])
     for name, marked in zip(names, known, strict=True):
         if int(marked.sum()) < 2:
@@ -100,7 +101,7 @@ def camera_turns(
                 "then and now. More let wrong ones be found"
             )
     matched = known.any(0)
-    found = [view.turn(matched, sigma, robust=True) for view in views]
+    found = [view.turn(matched, robust=True) for view in views]
     if (times := max(math.sqrt(_typical(turn)) for turn in found)) > adjustment.WRONG_AS_A_WHOLE:
         raise InputError(
             f"drift: no turn explains the marks: typically they are {times:.0f} times as far off as their sigma says; "
@@ -118,18 +119,19 @@ def camera_turns(
                 f"{gone} of {total} features have moved against the rest: these are not a few; check names, the sigma "
                 "of the marks and that the images are of these cameras"
             )
-        found = [view.turn(used, sigma) for view in views]
-    chi2 = sum(float((turn.off[used].nan_to_num() / sigma).square().sum()) for turn in found)
+        found = [view.turn(used) for view in views]
+    each = zip(found, views, strict=True)
+    chi2 = sum(float((turn.off / view.sigma)[used].nan_to_num().square().sum()) for turn, view in each)
     freedom = 2 * int((known & used).sum()) - 3 * len(cameras)
     variance = variance_factor(chi2, freedom)
     return CameraTurns([turn._replace(covariance=variance * turn.covariance) for turn in found], used, over, variance)
 
 
 class _MarksTwice:
-    """Marks in one camera then and now, (F, 2)."""
+    """Marks in one camera then and now, (F, 2), and the sigma (F, 1) of their difference along an axis."""
 
-    def __init__(self, camera: Camera, then: Tensor, now: Tensor) -> None:
-        self.camera = camera
+    def __init__(self, camera: Camera, then: Tensor, now: Tensor, sigma: Tensor) -> None:
+        self.camera, self.sigma = camera, sigma
         rays, valid = camera.unproject(then)
         self.known = valid & torch.isfinite(now).all(-1)
         self.points = FAR * rays
@@ -141,15 +143,15 @@ class _MarksTwice:
         pixels, rows = seen_turned(self.camera, self.points, rotation)
         return pixels.T, rows[:3].permute(2, 1, 0)
 
-    def turn(self, used: Tensor, sigma: Tensor | float, *, robust: bool = False) -> CameraTurn:
-        """The turn that takes the marks of then to those of now; `sigma` of their difference along an axis."""
-        used = used & self.known
+    def turn(self, used: Tensor, *, robust: bool = False) -> CameraTurn:
+        """The turn that takes the marks of then to those of now."""
+        used, sigma = used & self.known, self.sigma
 
         def weighted(rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             pixels, rows = self._project(rotation)
             scaled = torch.where(self.known[:, None], self.moved - pixels, torch.nan) / sigma
             loss = adjustment.LOSS.weight(0.5 * scaled.square().sum(-1)) if robust else torch.ones_like(scaled[:, 0])
-            return torch.where(used, loss.sqrt(), 0.0), rows / sigma, scaled
+            return torch.where(used, loss.sqrt(), 0.0), rows / sigma[..., None], scaled
 
         def look(rotation: Tensor, _: Tensor) -> tuple[Tensor, Tensor]:
             root, rows, scaled = weighted(rotation)
@@ -410,11 +412,13 @@ def measure_drift(
 def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift:
     """How the cameras have turned since the marks of then, with the left camera's attitude then, if it is known."""
     then, now = features.pixels.unflatten(1, (2, 2)).unbind(1)
-    sigma = math.sqrt(2.0) * features.pixel_sigma
+    sigma = features.each_sigma.unflatten(1, (2, 2)).norm(dim=1)
     found = camera_turns((rig.left, rig.right), _NAMES, then, now, sigma)
     items = []
     for i, feature in enumerate(features.names):
         off = {name: float(turn.off[i].norm()) for name, turn in zip(_NAMES, found.each, strict=True)}
+        sigmas = [length / one for length, one in zip(off.values(), sigma[i].tolist(), strict=True)]
+        sigmas = [one for one in sigmas if math.isfinite(one)]
         off = {name: length for name, length in off.items() if math.isfinite(length)}
         moved = ", ".join(f"{length:.1f} px ({name})" for name, length in off.items())
         reason = f"it has moved by {moved}" if off else "no camera has a mark of it both then and now"
@@ -423,7 +427,7 @@ def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift
                 source="features",
                 name=feature,
                 pixels=tuple(off.get(name) for name in _NAMES),
-                sigmas=math.hypot(*off.values()) / (sigma * math.sqrt(2 * len(off))) if off else math.inf,
+                sigmas=math.hypot(*sigmas) / math.sqrt(2 * len(sigmas)) if sigmas else math.inf,
                 over_limit=float(found.over_limit[i]),
                 used=bool(found.used[i]),
                 reason="" if found.used[i] else reason,
@@ -601,7 +605,7 @@ def check_rig(rig: Rig, *, features: Features | None = None, landmarks: Landmark
 
 
 def seen_again(then: Marks, now: Marks, sigma: float) -> Features:
-    """Points of unknown range that are marked in old and new images, for `check_rig`; `sigma` of a mark, pixels.
+    """Points of unknown range that are marked in old and new images, for `check_rig`; `sigma` px where none is stated.
 
     Raises:
         InputError: no name is in both.
@@ -616,14 +620,14 @@ def seen_again(then: Marks, now: Marks, sigma: float) -> Features:
     common = tuple(name for name in then.names if name in now.names)
     if not common:
         raise InputError("no name is in both files of marks; give the same points the same names")
-    pixels = [marks.pixels[[marks.names.index(name) for name in common]] for marks in (then, now)]
+    both = [(marks, [marks.names.index(name) for name in common]) for marks in (then, now)]
     unknown = torch.zeros(len(common), dtype=torch.float64)
     return Features(
         names=common,
-        pixels=torch.cat(pixels, 1),
+        pixels=torch.cat([marks.pixels[rows] for marks, rows in both], 1),
         inverse_range=unknown,
         inverse_range_sigma=torch.full_like(unknown, torch.inf),
-        pixel_sigma=sigma,
+        pixel_sigma=torch.cat([marks.sigmas(sigma)[rows] for marks, rows in both], 1),
     )
 
 

@@ -13,6 +13,7 @@ import torch
 from kcal import FileError, InputError, Origin
 from kcal.lens import rotation_from_vector
 from kcal.locate import enu_from_cam, enu_to_geodetic, read_marks
+from kcal.locate.marks import COVARIANCE
 from kcal.locate.mounting import attitude, mounting_of
 from kcal.locate.survey import camera_positions, import_survey, match_landmarks, read_features, read_survey
 
@@ -90,6 +91,17 @@ class TestSurvey:
 
 
 class TestFeatures:
+    def test_what_the_table_states_of_its_marks_counts(self, tmp_path: Path) -> None:
+        long = "name,camera,u,v,sigma,range,range_sigma\nroof,left,1,2,0.05,,\nroof,right,3,4,,500,10\n"
+        found = read_features(write(tmp_path, long), 0.4)
+        assert found.each_sigma.tolist() == [[0.05, 0.4]]
+        assert found.inverse_range.tolist() == [1 / 500]
+        with pytest.raises(FileError, match="line 3: range of 'roof' is 500, and 400 in an earlier line"):
+            read_features(write(tmp_path, long.replace("0.05,,", "0.05,400,10")), 0.4)
+        wide = "left_u,left_v,right_u,right_v," + ",".join(COVARIANCE) + "\n1,2,3,4,.01,0,0,0,.01,0,0,.04,0,.04\n"
+        found = read_features(write(tmp_path, wide), 0.4)
+        assert found.each_sigma.tolist() == [[pytest.approx(0.1), pytest.approx(0.2)]]
+
     def test_what_is_known_of_the_range(self, tmp_path: Path) -> None:
         header = "name,left_u,left_v,right_u,right_v,range,range_sigma,beyond\n"
         rows = ["peak,1,2,3,4,20000,2000,", "star,1,2,3,4,inf,,", "ridge,1,2,3,4,,,8000", "roof,1,2,3,4,,,"]
@@ -107,7 +119,7 @@ class TestFeatures:
     )
     def test_contradictions(self, tmp_path: Path, cells: str, message: str) -> None:
         header = "name,left_u,left_v,right_u,right_v,range,range_sigma,beyond\n"
-        with pytest.raises(FileError, match=f"line 2: .*{message}"):
+        with pytest.raises(FileError, match=f"csv: a: .*{message}"):
             read_features(write(tmp_path, header + f"a,1,2,3,4,{cells}\n"), 0.1)
 
 
@@ -203,6 +215,15 @@ def test_bad_files(tmp_path: Path, name: str, text: str, what: str) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(FileError, match=what):
         import_survey(tmp_path / name, **({"sigma": 0.1, "geoid": 0.0} if name == "a.gpx" else {}))
+
+
+def test_places_of_a_table_may_lack_a_sigma_that_is_given(tmp_path: Path) -> None:
+    path = write(tmp_path, "name,east,north,up,sigma,sigma_up\na,1,2,3,0.1,\nb,4,5,6,,\nc,4,5,6,,2\n")
+    assert import_survey(path, sigma=0.5).sigma.tolist() == [[0.1] * 3, [0.5] * 3, [0.5, 0.5, 2.0]]
+    plain = write(tmp_path, "name,east,north,up\na,1,2,3\n")
+    assert import_survey(plain, sigma=0.5).sigma.tolist() == [[0.5] * 3]
+    with pytest.raises(InputError, match="sigma must be positive"):
+        import_survey(plain, sigma=-1.0)
 
 
 def test_elevations_need_a_geoid(tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ class TestTables:
                 "hill,a,5,6,,,inf\n")  # fmt: skip
         found = read_features(table(tmp_path, text), 0.4, NAMES)
         assert found.names == ("mast", "mill", "hill")
-        assert found.pixel_sigma == 0.4
+        assert found.each_sigma.nan_to_num().tolist() == [[0.4, 0.4, 0.0], [0.4, 0.0, 0.0], [0.4, 0.0, 0.0]]
         assert found.inverse_range.tolist() == [1 / 500, 0.0, 0.0]
         assert found.inverse_range_sigma[:2].tolist() == [10 / 500**2, math.inf]
         assert 0.0 < float(found.inverse_range_sigma[2]) < 1e-6
@@ -215,6 +215,8 @@ def test_things_that_are_marked_again() -> None:
     assert found.pixels[1].tolist() == [[5, 6], [11, 12], [21, 22], [27, 28]]
     assert found.inverse_range.tolist() == [0.0, 0.0]
     assert found.inverse_range_sigma.tolist() == [math.inf] * 2
-    assert found.pixel_sigma == 0.4
+    assert found.each_sigma.tolist() == [[0.4] * 4] * 2
+    stated = then._replace(sigma=tensor([0.1, 0.2], [1, 1], [math.nan, 0.3]))
+    assert seen_again(stated, now, 0.4).each_sigma.tolist() == [[0.1, 0.2, 0.4, 0.4], [0.4, 0.3, 0.4, 0.4]]
     with pytest.raises(InputError, match="no name is in both"):
         seen_again(then, Marks.of_pair(("x",), tensor([1, 2]), tensor([1, 2])), 0.4)

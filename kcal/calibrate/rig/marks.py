@@ -191,7 +191,7 @@ class Features(MarkSource):
         pixels: (F, C, 2) marks.
         inverse_range: (F,) one over meters from the middle of the rig; 0 at infinity.
         inverse_range_sigma: (F,) its standard deviation; infinite where the range is not known.
-        pixel_sigma: of a mark along an axis, px.
+        pixel_sigma: of a mark along an axis, px; one number for all, or (F, C) for each mark.
         covariance: (F, C, 2, 2) px² of marks, in place of `pixel_sigma`.
         effects: errors that marks of many of them share, beyond these.
     """
@@ -206,7 +206,7 @@ class Features(MarkSource):
     pixels: Tensor
     inverse_range: Tensor
     inverse_range_sigma: Tensor
-    pixel_sigma: float = 0.3
+    pixel_sigma: float | Tensor = 0.3
     covariance: Tensor | None = None
     effects: tuple[Effect, ...] = ()
 
@@ -220,8 +220,9 @@ class Features(MarkSource):
 
     def by_mark(self) -> Features:
         """See `MarkSource.by_mark`."""
-        alike = self.pixel_sigma**2 * torch.eye(2, dtype=torch.float64).expand(*self.pixels.shape, 2)
-        return self if self.covariance is not None else dataclasses.replace(self, covariance=alike)
+        alike = torch.diag_embed(self.each_sigma.square()[..., None].expand_as(self.pixels))
+        covariance = alike if self.covariance is None else self.covariance
+        return dataclasses.replace(self, pixel_sigma=self.each_sigma, covariance=covariance)
 
     def begin(self, cameras: Sequence[Camera], start: Start) -> Tensor:
         """See `ItemSource.begin`; along the ray of the first camera that has one, at the range that is expected."""
