@@ -416,6 +416,6 @@ def _height_ahead(
         off = place_enu(point, frame.ecef_from_enu, frame.ecef_of_origin)[..., 2] - target
         slope = torch.where(reached, climb + 2.0 * curve * far, -1.0)
         far = far - torch.where(reached, off, 0.0) / slope
-    away = point - place
-    level = away - (away * up).sum(-1, keepdim=True) * up
-    return StatedHeight(point, up + 2.0 * frame.half_curvature * level, torch.full_like(height, sigma), reached)
+    lat, lon, _ = place_enu(point, frame.ecef_from_enu, frame.ecef_of_origin).deg2rad().unbind(-1)
+    normal = torch.stack([lat.cos() * lon.cos(), lat.cos() * lon.sin(), lat.sin()], -1) @ frame.ecef_from_enu
+    return StatedHeight(point, normal, torch.full_like(height, sigma), reached)

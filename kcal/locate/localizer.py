@@ -81,9 +81,9 @@ class Localizer(Operations, Movable, StatedModule):
 
     Geometry runs in float64 whatever the pipeline around it uses. There is no branch on values under `torch.compile`,
     `torch.export` and `vmap`: bad views are then sought once, and one is found; otherwise again until two are left.
-    Gradients by pixels, covariances, velocities, heights, cameras, poses and errors are exact and finite; what one
-    camera and a stated height locate has error bars without a gradient. `free("origin")` and `free("attitude")` let
-    gradients reach the mounting of two cameras, as `Rig.free` the poses.
+    Gradients by pixels, covariances, velocities, heights, cameras, poses and errors are exact and finite; those of what
+    one camera and a stated height locate are good to 1e-4, and its error bars have none. `free("origin")` and
+    `free("attitude")` let gradients reach the mounting of two cameras, as `Rig.free` the poses.
 
     Args:
         rig: cameras, their poses, and what is known of them: `Rig.root`. `Rig.placed` puts two cameras elsewhere, or

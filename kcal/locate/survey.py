@@ -41,6 +41,8 @@ from kcal.texts import briefly, csv_line, length_text
 EARTH, LOCAL = ("lat", "lon", "height"), ("east", "north", "up")
 RANGES = ("range", "range_sigma", "beyond")
 PLACE_COLUMNS = ("name", *EARTH, *LOCAL, "sigma", "sigma_up", "note")
+# Meters: no landmark is so far from its origin, and every place in a UTM zone is.
+_PROJECTED = 1.5e5
 # Degrees: places of one table that lie together, and one that does not.
 _TOGETHER, _APART = 0.5, 1.0
 # 1/m: how well the inverse range of a star is known.
@@ -114,6 +116,11 @@ def places_of(rows: Sequence[TableRow], path: str | Path, origin: Origin | None)
     whats = ["a number in meters" if column in (*LOCAL, "height") else "decimal degrees" for column in columns]
     values = torch.tensor([[*map(row.number, columns, whats)] for row in rows], dtype=torch.float64)
     if columns == LOCAL:
+        if origin and (farthest := float(values[:, :2].abs().amax())) > _PROJECTED:
+            raise FileError(
+                f"{path}: {length_text(farthest)} from the origin: east, north, up count from there. Convert UTM and "
+                "other projected coordinates to lat, lon, height (gdaltransform -s_srs EPSG:32612 -t_srs EPSG:4979)"
+            )
         return values, origin
     _refuse_exchanged(rows, values)
     for row, (lat, lon, height) in zip(rows, values.tolist(), strict=True):

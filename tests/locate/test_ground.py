@@ -199,3 +199,14 @@ def test_what_two_cameras_see_needs_no_ground(tmp_path: Path) -> None:
     without = Localizer(rig, pixel_sigma=0.3)(marks)
     assert without.status.tolist() == [6, 6, 6, 6, 6, 0]
     torch.testing.assert_close(found.enu[5], without.enu[5])
+
+
+def test_a_place_follows_the_stated_height() -> None:
+    """The slope is along the ellipsoid's own normal there: that of a sphere is off by 2.4e-6."""
+    rig = station_rig({"one": CAMERA}, [stands(pitch_deg=-12.0)], refraction_sigma=0.0)
+    pixels = torch.tensor([[[700.0, 600.0]], [[1300.0, 400.0]]]).double()
+    height = torch.tensor([-400.0, -900.0], dtype=torch.float64).requires_grad_()
+    localize = Localizer(rig)
+    (slope,) = torch.autograd.grad(localize(pixels, height=height).enu.norm(dim=-1).sum(), height)
+    higher, lower = (localize(pixels, height=height.detach() + by).enu.norm(dim=-1) for by in (0.1, -0.1))
+    torch.testing.assert_close(slope, (higher - lower) / 0.2, rtol=1e-6, atol=0)
