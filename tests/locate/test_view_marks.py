@@ -112,7 +112,7 @@ def test_features_of_any_two_cameras(tmp_path: Path) -> None:
     assert found.inverse_range.tolist() == pytest.approx([1 / 20_000, 0.5 / 5000, 0.0], rel=0.02)
     assert found.inverse_range_sigma[0] == pytest.approx(2000 / 20_000**2, rel=0.02)
     assert math.isinf(float(found.inverse_range_sigma[2]))
-    assert found.pixel_sigma == 0.4
+    assert found.each_sigma.nansum(1).tolist() == [0.8] * 3
 
 
 def test_a_long_table_is_located_as_a_short_one(
