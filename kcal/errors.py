@@ -20,6 +20,19 @@ class FileError(KcalError):
     """A file that cannot be read, is not what it should be, or cannot be written."""
 
 
+class ContradictionError(InputError):
+    """Measurements of which some contradict all the rest.
+
+    Args:
+        text: the message.
+        kind: of data that are wrong as a whole, such as "landmarks"; empty for one value, which is measured again.
+    """
+
+    def __init__(self, text: str, kind: str = "") -> None:
+        super().__init__(text)
+        self.kind = kind
+
+
 class DegenerateError(KcalError):
     """Data that do not determine the answer: too few views, parallel boards, an unstable focal length."""
 

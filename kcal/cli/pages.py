@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +14,7 @@ from kcal.cli.board import board_in_images, given_board
 from kcal.cli.console import err, out, show_page, warn
 from kcal.cli.inputs import IMAGES, pixel_sigma_of
 from kcal.cli.options import Kind
-from kcal.errors import InputError
+from kcal.errors import InputError, KcalError
 
 _MARK_PORT, _CAPTURE_PORT = 8347, 8348
 
@@ -145,6 +144,7 @@ def capture_command(
     if session.views:
         err.print(f"{output} has {session.views} views; going on")
     stop = threading.Event()
+    failed: list[KcalError] = []
 
     def over() -> bool:
         return stop.is_set() or bool(session.finished)
@@ -154,27 +154,36 @@ def capture_command(
             for shot in rooms.shots(source, over, lambda text: err.print(text)):
                 if session.offer(shot.image, shot.name, moving=shot.moving):
                     out.print(f"{session.views}: {shot.name}")
-        finally:
-            stop.set()
+        except KcalError as error:
+            failed.append(error)
+        stop.set()
 
+    threads = [
+        threading.Thread(target=watch),
+        threading.Thread(target=rooms.follow, args=(session,), kwargs={"until": over}),
+    ]
     server = None
     if page:
         server = rooms.LocalServer(
             lambda token, hosts: rooms.capture_app(session, stop, token, hosts), port, fallback=port == _CAPTURE_PORT
         )
         show_page(server.address, "capture page", browser=browser)
-    with ThreadPoolExecutor() as pool:
-        try:
-            tasks = [pool.submit(watch), pool.submit(rooms.follow, session, until=over)]
-            if server is None:
-                _tell(session, over)
-            else:
-                threading.Thread(target=_stop_server, args=(tasks, server), daemon=True).start()
-                server.run()
-        finally:
-            stop.set()
-    for task in tasks:
-        task.result()
+    try:
+        for thread in threads:
+            thread.start()
+        if server is None:
+            _tell(session, over)
+        else:
+            threading.Thread(target=_stop_server, args=(threads, server), daemon=True).start()
+            server.run()
+    finally:
+        stop.set()
+        for thread in threads:
+            # An interruption may come before all have started.
+            if thread.ident is not None:
+                thread.join()
+    if failed:
+        raise failed[0]
     # What came last has not been thought about yet.
     session.think()
     if session.finished:
@@ -189,9 +198,10 @@ def capture_command(
     out.print(f"next: kcal calibrate {output} -o {output.with_name(camera)}", soft_wrap=True)
 
 
-def _stop_server(tasks: list[Future[None]], server: rooms.LocalServer) -> None:
+def _stop_server(threads: list[threading.Thread], server: rooms.LocalServer) -> None:
     """Stop the server when all is captured, a moment later: the page still asks how it ended."""
-    wait(tasks)
+    for thread in threads:
+        thread.join()
     time.sleep(1.5)
     server.stop()
 

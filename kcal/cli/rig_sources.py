@@ -17,7 +17,7 @@ from kcal.cli.console import aligned, ending_with, look_at_views, mark_again, st
 from kcal.cli.inputs import pixel_sigma_and_source, typed_with
 from kcal.cli.options import Kind, Rare, Several
 from kcal.cli.stars import Night
-from kcal.errors import DegenerateError, InputError, KcalError
+from kcal.errors import ContradictionError, DegenerateError, InputError, KcalError
 from kcal.texts import measured_text
 from kcal.values import WithSigma, named, with_sigma
 
@@ -589,7 +589,9 @@ def _cure_of(option: str, sources: Sources, paths: Sequence[Path], _: object = N
 
 
 def cure_of_all(error: KcalError, sources: Sources, paths: Sequence[Path]) -> str:
-    """The command after a refusal of all sources together: another look at the only one, or more marks."""
+    """The command after a refusal of all sources together: another look at the wrong one, or more marks."""
+    if isinstance(error, ContradictionError):
+        return _cure_of("pairs" if error.kind == "boards" else error.kind, sources, paths)
     if sources.pairs and sources.landmarks is None and isinstance(error, InputError):
         return _cure_of("pairs", sources, paths)
     marked = sources.marks or sources.features or isinstance(error, DegenerateError)

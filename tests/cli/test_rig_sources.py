@@ -265,6 +265,17 @@ def test_refusals(site: Path, command: Command, arguments: str, message: str) ->
     assert not (site / "rig.json").exists()
 
 
+def test_a_wrong_baseline_is_measured_again_and_wrong_marks_are_marked_again(site: Path, command: Command) -> None:
+    said = command(SOLVE, "--baseline 10.3±0.001 -o rig.json", code=1).err
+    assert "baseline left to right contradicts" in said
+    assert "kcal " not in said
+    rows = (site / "marks.csv").read_text().splitlines()
+    (site / "marks.csv").write_text(
+        "\n".join([*rows[:1], *(row.replace(f"post{i}", f"post{(i + 5) % 12}") for i, row in enumerate(rows[1:]))])
+    )
+    assert "kcal mark left.png right.png --cameras left.json right.json" in command(SOLVE, "-o rig.json", code=1).err
+
+
 def test_usage(site: Path, command: Command) -> None:
     command(SOLVE, "-o rig.json")
     assert "--reference" in command("rig check rig.json --marks now.csv", code=1).err

@@ -13,7 +13,7 @@ from kcal.calibrate.rig.problem import RigProblem
 from kcal.calibrate.rig.source import OWN, Context, Effects, ItemFit, ItemSource, RigState, Start, typical_ratio
 from kcal.calibrate.rig.sources import BoardBlock, RigData
 from kcal.calibrate.rig.unknowns import SharedUnknowns
-from kcal.errors import InputError
+from kcal.errors import ContradictionError
 from kcal.solve.lm import LMOptions, Result, RobustLoss, minimize
 
 # Adjust a rig: minimize all blocks together, and leave out what is beyond its limit.
@@ -298,9 +298,10 @@ def without_wrong(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
     squares, freedom = work.squares(mask), work.freedom(mask)
     for source, at in work.sources:
         if (times := math.sqrt(typical_ratio(squares[at], freedom[at]))) > WRONG_AS_A_WHOLE:
-            raise InputError(
+            raise ContradictionError(
                 f"the {source.kind} contradict each other or the rest: typically they are {times:.0f} times as far off "
-                f"as their sigmas say; {source.checks}"
+                f"as their sigmas say; {source.checks}",
+                source.kind,
             )
     kept = mask & ~(work.over_limit(mask, squares) > 1.0)
     _refuse_many(work, kept, mask)
@@ -337,7 +338,8 @@ def _refuse_many(work: Adjustment, kept: Tensor, mask: Tensor) -> None:
         gone = len(wrong)
         if gone > max(1, MOST_WRONG * total):
             names = ", ".join(source.names[i] for i in wrong[:6])
-            raise InputError(
+            raise ContradictionError(
                 f"{gone} of {total} {source.kind} contradict the rest ({names}{' ...' if gone > 6 else ''}): these are "
-                f"not a few wrong ones; {source.checks}"
+                f"not a few wrong ones; {source.checks}",
+                source.kind,
             )

@@ -17,7 +17,7 @@ from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, RigSolution, least
 from kcal.calibrate.rig.source import ItemSource, RigState
 from kcal.checks import beyond_chance, variance_factor
-from kcal.errors import InputError
+from kcal.errors import ContradictionError
 from kcal.finding import Finding
 from kcal.gaussian import triangular
 
@@ -373,7 +373,7 @@ def contradicting_source(work: Adjustment, solution: RigSolution, *, refuse: boo
     certain = test.sigmas > _CERTAIN
     # Nothing but itself supports a measured baseline or position.
     if certain and refuse and own[named] <= 0:
-        raise InputError(text)
+        raise ContradictionError(text)
     return [Finding("contradiction", "stop" if certain else "doubt", text)]
 
 

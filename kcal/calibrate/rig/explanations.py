@@ -18,7 +18,7 @@ from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, RigSolution, g
 from kcal.calibrate.rig.resection import consensus_pose
 from kcal.calibrate.rig.source import RigState
 from kcal.calibrate.rig.sources import RigData
-from kcal.errors import DegenerateError, InputError
+from kcal.errors import ContradictionError, DegenerateError, InputError
 from kcal.finding import Finding
 from kcal.solve.lm import LMOptions
 from kcal.texts import measured_length
@@ -299,9 +299,9 @@ def _excess(found: _Explanation) -> float:
     return found.fit.chi2 - found.fit.freedom
 
 
-def _blamed(found: _Explanation) -> InputError:
+def _blamed(found: _Explanation) -> ContradictionError:
     one = "s" if len(found.names) == 1 else ""
-    return InputError(
+    return ContradictionError(
         f"{' and '.join(found.names)} contradict{one} the rest, which agrees otherwise (χ² {found.fit.chi2:.3g}): "
         "measure again, correct the value or its sigma, or leave it out"
     )
