@@ -202,7 +202,9 @@ def judged_rig(
     def drawn() -> dict[str, bytes]:
         """With those of the cameras, named as findings of a rig name them."""
         own = {f"{one.subject}-{picture}": data for one, make, _ in found for picture, data in make().items()}
-        return own if result is None else rooms.rig_pictures(result) | own
+        if result is None:
+            return own
+        return {"rig": rooms.picture_bytes(kcal.report.rig_figure(result, narrow=True))} | own
 
     # Tables of cameras that were not calibrated again are as the rig's file has them.
     again_made = [] if result is not None else [table for one in found for table in one.tables]

@@ -125,12 +125,14 @@ from kcal.pipeline.video_source import FramesTogether as FramesTogether
 from kcal.pipeline.video_source import Videos as Videos
 from kcal.report.calibration import FailedImage as FailedImage
 from kcal.report.calibration import board_figure as board_figure
+from kcal.report.calibration import camera_pictures as camera_pictures
 from kcal.report.calibration import coverage_figure as coverage_figure
 from kcal.report.calibration import difference_figure as difference_figure
 from kcal.report.calibration import gallery_figure as gallery_figure
 from kcal.report.calibration import interval_figure as interval_figure
 from kcal.report.calibration import models_figure as models_figure
 from kcal.report.calibration import range_label as range_label
+from kcal.report.figures import picture_bytes as picture_bytes
 from kcal.report.judge_camera import fault_of_views as fault_of_views
 from kcal.report.judge_camera import other_views as other_views
 from kcal.report.judge_camera import stored_verdict as stored_verdict
@@ -160,8 +162,6 @@ from kcal.report.tables import position_rows as position_rows
 from kcal.report.tables import range_sigma_rows as range_sigma_rows
 from kcal.report.tables import truth_rows as truth_rows
 from kcal.report.verdict import Verdict as Verdict
-from kcal.report.verdict_pictures import camera_pictures as camera_pictures
-from kcal.report.verdict_pictures import rig_pictures as rig_pictures
 from kcal.report.view import view_image as view_image
 from kcal.scene.match import match_scene as match_scene
 from kcal.scene.match import scene_of as scene_of

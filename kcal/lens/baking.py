@@ -310,11 +310,6 @@ _Exact = Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
 _Errors = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
-class _Box(NamedTuple):
-    low: tuple[float, float]
-    high: tuple[float, float]
-
-
 class _Table(NamedTuple):
     spline: Spline
     bound: float
@@ -353,7 +348,7 @@ def bake(camera: Camera, tolerance: float = 1e-3) -> LookupCamera:
     if not (math.isfinite(tolerance) and tolerance >= 1e-8):
         raise InputError(f"bake: the tolerance must be at least 1e-8 px, got {tolerance}")
     width, height = camera.size
-    image = _Box((-0.5, -0.5), (width - 0.5, height - 0.5))
+    image = camera.params.new_tensor([[-0.5, -0.5], [width - 0.5, height - 0.5]])
 
     def to_chart(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         rays, valid = camera.unproject(pixels)
@@ -372,9 +367,8 @@ def bake(camera: Camera, tolerance: float = 1e-3) -> LookupCamera:
     def pixel_errors(_: Tensor, pixels: Tensor, exact: Tensor) -> Tensor:
         return torch.linalg.vector_norm(pixels - exact, dim=-1)
 
-    seen = _chart_box(to_chart, image, camera.params)
-    inverse = _fit_table("unproject", to_chart, reprojection_errors, image, tolerance, camera.params)
-    forward = _fit_table("project", to_pixels, pixel_errors, seen, tolerance, camera.params)
+    inverse = _fit_table("unproject", to_chart, reprojection_errors, image, tolerance)
+    forward = _fit_table("project", to_pixels, pixel_errors, _chart_box(to_chart, image), tolerance)
     return LookupCamera(
         size=camera.size,
         pixels_from_chart=forward.spline,
@@ -393,21 +387,20 @@ def _lattice(low: Tensor, step: Tensor, rows: int, columns: int) -> Tensor:
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
 
 
-def _chart_box(to_chart: _Exact, image: _Box, like: Tensor) -> _Box:
-    """The rectangle of the chart that contains the rays of the image, with a margin of 1 %."""
-    low, high = like.new_tensor(image.low), like.new_tensor(image.high)
+def _chart_box(to_chart: _Exact, image: Tensor) -> Tensor:
+    """The rectangle (low, high) of the chart that contains the rays of the image, with a margin of 1 %."""
+    low, high = image
     chart, valid, _ = to_chart(_lattice(low, (high - low) / 128, 129, 129).reshape(-1, 2))
     if not bool(valid.any()):
         raise DegenerateError("bake: no pixel of the image has a ray; check the camera")
     least, most = chart[valid].amin(0), chart[valid].amax(0)
     margin = 0.01 * (most - least)
-    (left, top), (right, bottom) = (least - margin).tolist(), (most + margin).tolist()
-    return _Box((left, top), (right, bottom))
+    return torch.stack([least - margin, most + margin])
 
 
-def _fit_table(name: str, exact: _Exact, errors: _Errors, box: _Box, tolerance: float, like: Tensor) -> _Table:
+def _fit_table(name: str, exact: _Exact, errors: _Errors, box: Tensor, tolerance: float) -> _Table:
     """Refine a table until it keeps the tolerance on enough of the image."""
-    low, high = like.new_tensor(box.low), like.new_tensor(box.high)
+    low, high = box
     cells = _FEWEST
     while True:
         table, worst = _build_table(exact, errors, low, high, cells, tolerance)

@@ -254,7 +254,7 @@ def range_sigmas(
     rig: Rig,
     distances: Tensor | Sequence[float] | None = None,
     *,
-    pixel_sigma: float = 0.3,
+    pixel_sigma: float | None = None,
     pixel: Sequence[float] | None = None,
 ) -> RangeSigmas:
     """Split the standard deviation of ranges by its sources.
@@ -266,7 +266,7 @@ def range_sigmas(
     Args:
         rig: with its `covariance` and `mounting`; where one is None, its part is 0.
         distances: (D,) ranges from the left camera, meters; `usual_ranges` if left out.
-        pixel_sigma: of a mark along each axis, px.
+        pixel_sigma: of a mark along each axis, px; if left out, as in `Localizer`.
         pixel: where in the left image; the direction in which both cameras' axes look, if left out.
 
     Raises:
@@ -321,7 +321,7 @@ _PLACES = (0.2, 0.35, 0.5, 0.65, 0.8)
 
 
 @torch.no_grad()
-def station_sigmas(rig: Rig, distance: float, *, pixel_sigma: float = 0.3) -> RangeSigmas | None:
+def station_sigmas(rig: Rig, distance: float, *, pixel_sigma: float | None = None) -> RangeSigmas | None:
     """Split the standard deviation of ranges from each camera by its sources, where it is worst.
 
     Looked at are points at a distance from each camera, along the middle row of its image, that another camera sees
@@ -331,7 +331,7 @@ def station_sigmas(rig: Rig, distance: float, *, pixel_sigma: float = 0.3) -> Ra
     Args:
         rig: with its `root`; None: lenses and poses count as exact.
         distance: meters.
-        pixel_sigma: of a mark along each axis, px.
+        pixel_sigma: of a mark along each axis, px; if left out, as in `Localizer`.
 
     Returns:
         the worst place, (1,) each; None where no two cameras see the same at this distance.
@@ -490,7 +490,7 @@ class RangeCheck:
 
 @torch.no_grad()
 def check_ranges(
-    rig: Rig, marks: Marks, ranges: Tensor, sigmas: Tensor, *, pixel_sigma: float = 0.3, level: float = 0.05
+    rig: Rig, marks: Marks, ranges: Tensor, sigmas: Tensor, *, pixel_sigma: float | None = None, level: float = 0.05
 ) -> RangeCheck:
     """Compare a rig's ranges with known ones, jointly, and say whether yaw, scale or noise explains the errors.
 
@@ -505,7 +505,7 @@ def check_ranges(
         marks: of N points in both images; their covariance, where stated, replaces `pixel_sigma`.
         ranges: (N,) meters from the left camera.
         sigmas: (N,) meters, standard deviations of these; independent of each other.
-        pixel_sigma: of a mark along an axis, px.
+        pixel_sigma: of a mark along an axis, px; if left out, as in `Localizer`.
         level: share of rigs with true intervals that fail.
 
     Raises:

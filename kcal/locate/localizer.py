@@ -89,7 +89,8 @@ class Localizer(Operations, Movable, StatedModule):
         rig: cameras, their poses, and what is known of them: `Rig.root`. `Rig.placed` puts two cameras elsewhere, or
             into other light.
         weights: see above.
-        pixel_sigma: standard deviation of a mark along each axis, px, where no covariance is given.
+        pixel_sigma: standard deviation of a mark along each axis, px, where no covariance is given. If left out: what
+            the rig's calibration states, as files of kcal do, otherwise 0.3.
         clock_sigma: standard deviation of each camera's clock, seconds; counts where `forward` is told velocities.
         root: (K, P) like `rig.root`, in its place: for example `rig.with_errors(...)`.
 
@@ -147,7 +148,7 @@ class Localizer(Operations, Movable, StatedModule):
         rig: Rig,
         *,
         weights: Weights | None = None,
-        pixel_sigma: float = 0.3,
+        pixel_sigma: float | None = None,
         clock_sigma: float = 0.0,
         root: Tensor | None = None,
     ) -> None:
@@ -160,7 +161,7 @@ class Localizer(Operations, Movable, StatedModule):
             rig = copy.copy(rig)
             rig.root = root
         self.weights: Weights = weights or ("marks" if rig.is_pair else "all")
-        for name, value in (("pixel_sigma", checked_sigma(pixel_sigma)), ("clock_sigma", clock_sigma)):
+        for name, value in (("pixel_sigma", checked_sigma(pixel_sigma, rig)), ("clock_sigma", clock_sigma)):
             self.register_buffer(name, scalar(value, rig.translation))
         self.lens: tuple[tuple[int, ...], ...] = ()
         if self.weights == "marks":

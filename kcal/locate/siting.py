@@ -547,14 +547,14 @@ def _table_site(row: TableRow, ground: Ground | None) -> Site:
 
 
 @torch.no_grad()
-def sites_of(rig: Rig, pixel_sigma: float = 0.3) -> list[Site]:
+def sites_of(rig: Rig, pixel_sigma: float | None = None) -> list[Site]:
     """The cameras of a rig as sites, with what is known of lens and attitude together, half-way over the image.
 
     What errors of several cameras have in common is not part of it: `Localizer` knows it.
 
     Args:
         rig: with an origin.
-        pixel_sigma: of a mark along each axis, px.
+        pixel_sigma: of a mark along each axis, px; if left out, as in `Localizer`.
 
     Raises:
         InputError: a rig without an origin.
@@ -570,7 +570,7 @@ def sites_of(rig: Rig, pixel_sigma: float = 0.3) -> list[Site]:
         >>> round(site.heading_deg), round(site.sigma_deg, 2), round(site.elevation_sigma_deg, 2)
         (90, 0.2, 0.04)
     """
-    sites, localize = [], Localizer(rig, weights="all")
+    sites, localize = [], Localizer(rig, weights="all", pixel_sigma=pixel_sigma)
     for c, (name, camera) in enumerate(zip(rig.names, rig.each, strict=True)):
         stands = station_mounting(rig, c)
         width, height = camera.size
@@ -584,7 +584,7 @@ def sites_of(rig: Rig, pixel_sigma: float = 0.3) -> list[Site]:
         steps = [
             torch.rad2deg((camera.unproject(pixels + step)[0] - rays).norm(dim=-1)) for step in torch.eye(2).double()
         ]
-        spread = torch.full((len(rays), 2), pixel_sigma**2, dtype=torch.float64)
+        spread = localize.pixel_sigma.square().repeat(len(rays), 2)
         position = 0.0
         if stands.covariance is not None:
             position = float((stands.covariance[:2, :2].trace() / 2).sqrt())

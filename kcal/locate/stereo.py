@@ -88,17 +88,20 @@ def flag_positions(code: Tensor, condition: Tensor, status: PositionStatus) -> T
     return torch.where(condition, code.new_full((), int(status)), code)
 
 
-def checked_sigma(pixel_sigma: float) -> float:
-    """The sigma of the marks as a float, after checking that it is positive."""
+def checked_sigma(pixel_sigma: float | None, rig: Rig) -> float:
+    """The sigma of the marks, positive: as given, or as the rig's calibration states, or 0.3 px."""
+    if pixel_sigma is None:
+        pixel_sigma = None if rig.calibration is None else rig.calibration.pixel_sigma
+        pixel_sigma = 0.3 if pixel_sigma is None else pixel_sigma
     if not 1e-6 <= pixel_sigma <= 1e6:
         # Beyond, squares of it leave the range of float64, or the accuracy of the arithmetic.
         raise InputError(f"pixel_sigma: a positive number of pixels, 1e-6 to 1e6, is needed, got {pixel_sigma}")
     return float(pixel_sigma)
 
 
-def checked_rig(rig: Rig, pixel_sigma: float) -> float:
-    """The sigma of the marks as a float, after checking that it is positive and that the rig has a baseline."""
-    sigma = checked_sigma(pixel_sigma)
+def checked_rig(rig: Rig, pixel_sigma: float | None) -> float:
+    """The same, after checking that the rig has a baseline."""
+    sigma = checked_sigma(pixel_sigma, rig)
     if len(rig) < 2:
         raise InputError("a rig of two cameras or more is needed: one camera measures no range")
     apart = (rig.center - rig.center[0]).norm(dim=-1).amax()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import kcal.report.figures as figures
-from kcal.calibrate.camera.advice import reached, unreached_share
+from kcal.calibrate.camera.advice import board_tilts, reached, unreached_share
 from kcal.calibrate.camera.at_setting import ComparisonResult
 from kcal.calibrate.camera.calibrate import CameraCalibrationResult
 from kcal.calibrate.camera.export import Misfit
-from kcal.calibrate.camera.trust import IntervalCheck
+from kcal.calibrate.camera.trust import Examination, IntervalCheck
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, board_text
 from kcal.corners.images import read_gray, to_8bit
 from kcal.corners.observations import Observations, View
@@ -499,3 +499,55 @@ def difference_figure(
     for axes, text in zip(panels, ("Difference", "Its standard deviation σ"), strict=False):
         axes.set_title(text, fontsize=10, loc="left")
     return figure
+
+
+# The pictures of a verdict's page: PNG bytes by name.
+
+
+def camera_pictures(result: CameraCalibrationResult, examination: Examination | None = None) -> dict[str, bytes]:
+    """Pictures of a calibration: coverage, uncertainty, residuals, views, poses; halves, model and board if known."""
+    width, height = result.observations.image_size
+    tall = 3.0 * height / width + 0.9
+    found = {
+        "coverage": _drawn(draw_coverage, result, tall),
+        "uncertainty": _drawn(draw_uncertainty, result, tall),
+        "residuals": _drawn(draw_residuals, result, 4.0),
+        "views": _drawn(draw_view_rms, result, 3.4),
+        "poses": _drawn(_draw_poses, result, 3.6),
+    }
+    if examination is not None:
+        for half in examination.halves:
+            apart = not half.alike and (half.difference.probability or 0.0) < 1e-3
+            if apart or "halves" not in found:
+                title = f"Difference of cameras from halves: {half.label}"
+                found["halves"] = figures.picture_bytes(difference_figure(half.difference, title, narrow=True))
+        if examination.model is not None:
+            figure = difference_figure(examination.model, "Difference from the hybrid lens", narrow=True)
+            found["model"] = figures.picture_bytes(figure)
+    board = ((examination and examination.reference) or result).measured_board
+    if board is not None and bool(board.amplitudes.any()):
+        found["board"] = figures.picture_bytes(board_figure(board))
+    return found
+
+
+def _drawn(
+    draw: Callable[[Axes, CameraCalibrationResult], None], result: CameraCalibrationResult, height: float
+) -> bytes:
+    figure = figures.framed_figure(4.4, height, dpi=160)
+    draw(figure.add_subplot(), result)
+    return figures.picture_bytes(figure)
+
+
+def _draw_poses(axes: Axes, result: CameraCalibrationResult) -> None:
+    """Tilt of each view against its distance, with a tick that shows its roll."""
+    used = result.cam_from_board_rotation.isfinite().all(-1).all(-1)
+    rotation, translation = result.cam_from_board_rotation[used], result.cam_from_board_translation[used]
+    tilts, distance = board_tilts(rotation).numpy(), translation.norm(dim=-1).numpy()
+    roll = torch.atan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1]).numpy()
+    arrows = {"color": figures.ACCENT, "pivot": "mid", "scale": 26.0, "width": 0.005, "headwidth": 4.0}
+    axes.quiver(distance, tilts, np.cos(roll), -np.sin(roll), **arrows)
+    axes.axhspan(0.0, 15.0, color=figures.FAINT, alpha=0.2, linewidth=0)
+    axes.set(xlabel="distance, m", ylabel="tilt, degrees", ylim=(0.0, max(50.0, 1.1 * float(tilts.max()))))
+    axes.margins(x=0.1)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_title("Poses; arrows: roll; gray: too little tilt", fontsize=10, loc="left")

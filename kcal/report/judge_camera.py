@@ -72,8 +72,7 @@ def view_findings(result: CameraCalibrationResult, noise: float | None = None) -
         _sides_finding(result.observations.names, "doubt"),
         _blur_finding(result.noise if noise is None else noise, _blurred_share(result.observations)),
     ]
-    if len(rotation) < _FEW_VIEWS:
-        found.append(_few_finding(len(rotation)))
+    found.append(_few_finding(len(rotation)))
     return [finding for finding in found if finding is not None]
 
 
@@ -82,9 +81,7 @@ def record_findings(record: CalibrationRecord) -> list[Finding]:
     found = [_sides_finding(tuple(record.per_view_rms), "stop")]
     if record.noise is not None:
         found.append(_blur_finding(record.noise, 0.0))
-    if record.views < _FEW_VIEWS:
-        found.append(_few_finding(record.views))
-    found += record.findings
+    found += [_few_finding(record.views), *record.findings]
     return [finding for finding in found if finding is not None]
 
 
@@ -109,7 +106,9 @@ def _sides_finding(names: Sequence[str], severity: Severity) -> Finding | None:
     return None
 
 
-def _few_finding(views: int) -> Finding:
+def _few_finding(views: int) -> Finding | None:
+    if views >= _FEW_VIEWS:
+        return None
     text = f"{views} views are few: a wrong one among them could not be noticed"
     return Finding("views", "doubt", text, "take 20 to 40 views")
 
@@ -513,9 +512,7 @@ def camera_verdict(
     # to be wrong of it counts as a fault.
     elsewhere = 0.0 if examination.model is None else max(examination.model.rms**2 - beyond**2, 0.0)
     sigma = max(_image_rms(result.camera), math.sqrt(elsewhere))
-    answers = tuple(
-        _camera_answer(result.camera, requirement, sigma, beyond, baseline, mark_sigma) for requirement in requirements
-    )
+    answers = _camera_answers(result.camera, requirements, sigma, beyond, baseline, mark_sigma)
     rotation = result.cam_from_board_rotation
     contradicted = any(finding.name == "halves" and finding.part == FAULTS for finding in against)
     return Verdict(
@@ -558,9 +555,7 @@ def stored_verdict(
         found.append(Finding("error-bars", "stop", text, "calibrate it with kcal calibrate"))
     return Verdict(
         subject=subject,
-        answers=tuple(
-            _camera_answer(camera, requirement, sigma, 0.0, baseline, mark_sigma) for requirement in requirements
-        ),
+        answers=_camera_answers(camera, requirements, sigma, 0.0, baseline, mark_sigma),
         findings=sorted_findings(found),
         basis=_BASIS.format(baseline, mark_sigma),
     )
@@ -610,10 +605,13 @@ def _image_rms(camera: Camera) -> float:
     return float(sigma.square().mean().sqrt()) if len(sigma) else math.inf
 
 
-def _camera_answer(
-    camera: Camera, requirement: Requirement, sigma: float, beyond: float, baseline: float, mark_sigma: float
-) -> RangeAnswer:
-    """The range of a target by two such cameras: Z² / (f B) for each pixel of disparity, which both cameras spoil."""
-    slope = math.sqrt(2.0) * requirement.distance**2 / (paraxial_focal(camera).mean[0] * baseline)
-    parts = {"marks": slope * mark_sigma, "lenses": slope * sigma, FAULTS: slope * beyond}
-    return RangeAnswer(requirement=requirement, parts=parts)
+def _camera_answers(
+    camera: Camera, needs: Sequence[Requirement], sigma: float, beyond: float, baseline: float, mark_sigma: float
+) -> tuple[RangeAnswer, ...]:
+    """Ranges of targets by two such cameras: Z² / (f B) for each pixel of disparity, which both cameras spoil."""
+    answers = []
+    for need in needs:
+        slope = math.sqrt(2.0) * need.distance**2 / (paraxial_focal(camera).mean[0] * baseline)
+        parts = {"marks": slope * mark_sigma, "lenses": slope * sigma, FAULTS: slope * beyond}
+        answers.append(RangeAnswer(requirement=need, parts=parts))
+    return tuple(answers)

@@ -14,6 +14,7 @@ from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.errors import InputError
 from kcal.files import read_bytes, write_atomic
 from kcal.lens.camera import Camera
+from kcal.report.shown import shown_parameters
 from kcal.report.verdict import RangeAnswer, Verdict
 from kcal.texts import length_text, number_text, page_data, page_policy, range_text, visible
 
@@ -31,7 +32,6 @@ CAPTIONS = {
     "board": "The board as the views show it, beside the one that was ordered.",
     "rig": "The site from above, and residuals by source and item.",
 }
-_MOST_PARAMETERS, MOST_HYBRID = 24, 8  # weights of a hybrid lens, 1e-7 each, say nothing one by one
 
 
 def verdict_page(
@@ -51,7 +51,7 @@ def verdict_page(
     """
     drawn = dict(pictures or {})
     if any(math.isfinite(answer.sigma) for answer in verdict.answers):
-        from kcal.report.verdict_pictures import range_picture
+        from kcal.report.positions import range_picture
 
         drawn = {"ranges": range_picture(verdict.answers), **drawn}
     return from_template(
@@ -148,7 +148,8 @@ def camera_tables(
         facts.append(["solver", result.status.message])
     sigma = dict(known.sigma) if known and known.sigma else {}
     rows = [["parameter", "value", "σ"]]
-    for name, value in list(zip(camera.names, camera.params.detach().tolist(), strict=True))[: _most(camera)]:
+    values = camera.params.detach().tolist()[: shown_parameters(camera.model.hybrid)]
+    for name, value in zip(camera.names, values, strict=False):
         own = sigma.get(name)
         rows.append([name, number_text(value, own, digits=6), "" if own is None else number_text(own, own)])
     tables = [facts, rows]
@@ -157,14 +158,10 @@ def camera_tables(
     return tables
 
 
-def _most(camera: Camera) -> int:
-    return MOST_HYBRID if camera.model.hybrid else _MOST_PARAMETERS
-
-
 def _correlations(camera: Camera) -> list[list[str]]:
     assert camera.calibration is not None
     assert camera.calibration.covariance is not None
-    names = camera.names[: _most(camera)]
+    names = camera.names[: shown_parameters(camera.model.hybrid)]
     covariance = camera.calibration.covariance[: len(names), : len(names)]
     spread = covariance.diagonal().clamp_min(0.0).sqrt()
     found = []

@@ -19,6 +19,7 @@ from torch import Tensor
 
 import kcal.report.figures as figures
 from kcal.errors import InputError
+from kcal.finding import FAULTS
 from kcal.locate.budget import RangeError
 from kcal.locate.geodesy import geodetic_to_enu
 from kcal.locate.positions import Located, Position, field_azimuths, region_outline
@@ -26,6 +27,7 @@ from kcal.locate.siting import Area, RankedSite, Site, SitingMap, siting_map
 from kcal.locate.stereo import PositionStatus
 from kcal.locate.tabulate import middle_row_ends
 from kcal.report.tables import range_sigma, range_unit
+from kcal.report.verdict import RangeAnswer
 from kcal.texts import Unit, length_text, range_text
 
 # Draw located points: a map with a logarithmic range scale, and the range intervals side by side.
@@ -399,6 +401,37 @@ def budget_figure(
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=9, loc="upper left")
     return figures.finished(axes)
+
+
+# Standard deviations of ranges for a verdict's page.
+
+_PART_COLORS = {"marks": figures.ACCENT, "lenses": "#dd7a1f", "relative pose": "#0f766e", FAULTS: figures.WARN}
+
+
+def range_picture(answers: Sequence[RangeAnswer]) -> bytes:
+    """Standard deviation of ranges by their sources, beside what is required."""
+    figure = figures.framed_figure(4.4, 1.3 + 0.6 * len(answers), dpi=160)
+    axes = figure.add_subplot()
+    names = list(answers[0].parts)
+    for row, answer in enumerate(answers):
+        far = answer.requirement.distance
+        total = answer.sigma
+        start = 0.0
+        for name in names:
+            # Shares of the variance, drawn as shares of the bar.
+            length = 100.0 * total / far * (answer.parts[name] / total) ** 2 if 0 < total < math.inf else 0.0
+            color, label = _PART_COLORS.get(name, figures.FAINT), None if row else name
+            axes.barh(row, length, left=start, color=color, height=0.5, label=label)
+            start += length
+        allowed = 100.0 * answer.requirement.meters / far
+        axes.plot([allowed, allowed], [row - 0.4, row + 0.4], color=figures.INK, linewidth=2.2)
+    axes.plot([], [], color=figures.INK, linewidth=2.2, label="required")
+    axes.set_yticks(range(len(answers)), [range_text(answer.requirement.distance) for answer in answers])
+    axes.invert_yaxis()
+    axes.set(xlabel="σ of the range, % (colors: shares of the variance)", xlim=(0.0, None))
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(frameon=False, fontsize=8.5, loc="outside upper left", ncols=3)
+    return figures.picture_bytes(figure)
 
 
 # A picture of sites: how well an area is seen and located today, and with the candidates that are worth most.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -261,13 +260,10 @@ def _above_sky(image: NDArray[Any]) -> NDArray[np.float64]:
         places = np.cumsum([0, *(part.shape[axis] for part in parts)])
         middles = 0.5 * (places[:-1] + places[1:] - 1)
         medians = np.stack([np.median(part, axis) for part in parts], axis)
-        sky = np.apply_along_axis(partial(_interpolated, middles, int(places[-1])), axis, medians)
+        every = np.arange(places[-1])
+        sky = np.apply_along_axis(lambda line, x=every, at=middles: np.interp(x, at, line), axis, medians)
     above = levels - sky
     return above / max(1.4826 * float(np.median(np.abs(above))), 1e-9)
-
-
-def _interpolated(places: NDArray[np.float64], count: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.interp(np.arange(count), places, values)
 
 
 # Draw the skyline of a terrain raster over an image, and how far the image's own is from it.

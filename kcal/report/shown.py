@@ -25,9 +25,12 @@ Blocks: TypeAlias = "Iterator[str | list[list[str]]]"
 ShownCamera: TypeAlias = "tuple[dict[str, Any], CameraSummary]"
 ShownRig: TypeAlias = "tuple[dict[str, Any], RigSummary]"
 
-# Parameters that are shown: of hybrid lenses those before the hundreds of weights, which say nothing one by one.
-_SHOWN, _SHOWN_HYBRID = 26, 8
 _INTRINSICS = ("fx", "fy", "cx", "cy", "skew")
+
+
+def shown_parameters(hybrid: object) -> int:
+    """How many parameters are shown: of hybrid lenses not the hundreds of weights, which say nothing one by one."""
+    return 8 if hybrid else 26
 
 
 def rig_blocks(rig: Rig) -> Blocks:
@@ -85,7 +88,7 @@ def camera_blocks(content: Mapping[str, Any], known: CameraSummary) -> Blocks:
     axis = ", on its axis; fx and fy below are parameters of the base projection alone" if hybrid else ""
     yield f"focal length {known.focal_length}{axis}"
     values = {name: content["intrinsics"][name] for name in _INTRINSICS} | content["coefficients"]
-    shown = _SHOWN_HYBRID if hybrid else _SHOWN
+    shown = shown_parameters(hybrid)
     rows = [["parameter", "value", "sigma"]]
     for name, value in list(values.items())[:shown]:
         error = known.sigma.get(name)

@@ -24,7 +24,7 @@ import numpy as np
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from scripts.bench import solver
-from scripts.shared.children import ALONE, answer
+from scripts.shared.children import ALONE, answer, or_failure
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import table
@@ -81,15 +81,9 @@ def spline(lens: str, seen: Observations, focal: float, timeout: float) -> dict[
     """Mrcal's splined lens, with no view held out."""
     pixels, none = seen.pixels().numpy(), np.arange(0)
     weight = np.isfinite(pixels).all(-1).astype(float)
-    try:
-        found = splined(
-            lens, pixels, weight, none, size=seen.image_size, board=seen.board, focal=focal, timeout=timeout
-        )
-    except subprocess.TimeoutExpired:
-        return {"failed": f"> {timeout:.0f} s"}
-    except subprocess.CalledProcessError as error:
-        return {"failed": error.stderr.strip().splitlines()[-1][:60]}
-    return {"seconds": found["cpu_s"]}
+    about: Any = {"size": seen.image_size, "board": seen.board, "focal": focal, "timeout": timeout}
+    found = or_failure(lambda: splined(lens, pixels, weight, none, **about))
+    return found if "failed" in found else {"seconds": found["cpu_s"]}
 
 
 def compare(views: int, repeats: int, timeout: float) -> list[Any]:

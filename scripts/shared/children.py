@@ -12,6 +12,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext
 from typing import Any
@@ -20,17 +21,31 @@ from unittest import mock
 ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
-def answer(*command: object, timeout: float | None = None) -> dict[str, Any]:
-    """The last line that a process with one thread prints, which is JSON; or {"failed": why}."""
+def answered(*command: object, timeout: float | None = None) -> dict[str, Any]:
+    """The last line that a process with one thread prints, which is JSON.
+
+    Raises:
+        subprocess.SubprocessError: it failed, or took longer.
+    """
     words, alone = list(map(str, command)), os.environ | ALONE
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, timeout=timeout, check=True, env=alone)
-    except subprocess.TimeoutExpired:
-        return {"failed": f"> {timeout:.0f} s"}
-    except subprocess.CalledProcessError as error:
-        return {"failed": (error.stderr.strip().splitlines() or ["killed"])[-1][:60]}
+    done = subprocess.run(words, capture_output=True, text=True, timeout=timeout, check=True, env=alone)
     found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
     return found
+
+
+def or_failure(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What work gives that asks processes; or {"failed": why}."""
+    try:
+        return work()
+    except subprocess.TimeoutExpired as error:
+        return {"failed": f"> {error.timeout:.0f} s"}
+    except subprocess.CalledProcessError as error:
+        return {"failed": (error.stderr.strip().splitlines() or ["killed"])[-1][:60]}
+
+
+def answer(*command: object, timeout: float | None = None) -> dict[str, Any]:
+    """The same as `answered`; or {"failed": why}."""
+    return or_failure(lambda: answered(*command, timeout=timeout))
 
 
 def children(*imported: str) -> ForkServerContext:

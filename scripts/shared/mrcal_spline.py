@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from kcal.corners.board import Board
-from scripts.shared.children import ALONE
+from scripts.shared.children import answered
 
 
 def splined(
@@ -60,9 +58,5 @@ def splined(
             square_m=board.square,
             focal=focal,
         )
-        done = subprocess.run(
-            [os.environ[f"KCAL_{peer.upper()}"], f"scripts/bench/peer_{peer}.py", str(path), lens, *field],
-            capture_output=True, text=True, timeout=timeout, check=True, env=os.environ | ALONE,
-        )  # fmt: skip
-    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
-    return found
+        interpreter = os.environ[f"KCAL_{peer.upper()}"]
+        return answered(interpreter, f"scripts/bench/peer_{peer}.py", path, lens, *field, timeout=timeout)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 from pathlib import Path
 
 import pytest
 import torch
 from command_line import Command
 
-from kcal import InputError, Localizer, Origin, load_rig
+from kcal import InputError, Localizer, Origin, load_rig, save_rig
+from kcal.locate import range_sigmas, sites_of
 from kcal.rig import Mounting
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
@@ -48,6 +50,18 @@ def test_what_is_given_replaces_what_the_rig_knows() -> None:
     narrow = Localizer(rig)
     assert narrow.included == ("marks", "mounting")
     assert (narrow(LEFT, RIGHT).inverse_range_sigma < own.inverse_range_sigma).all()
+
+
+def test_marks_have_the_noise_that_the_file_states(tmp_path: Path) -> None:
+    rig = load_rig(SAMPLE)
+    assert rig.calibration is not None
+    for stated, sigma in ((0.7, 0.7), (None, 0.3)):
+        rig.calibration = dataclasses.replace(rig.calibration, pixel_sigma=stated)
+        read = load_rig(save_rig(rig, tmp_path / "rig.json"))
+        assert [float(Localizer(read, weights=how).pixel_sigma) for how in (None, "all")] == [sigma, sigma]
+        assert torch.equal(range_sigmas(read).total, range_sigmas(read, pixel_sigma=sigma).total)
+        assert sites_of(read) == sites_of(read, sigma)
+        assert float(Localizer(read, pixel_sigma=0.1).pixel_sigma) == 0.1
 
 
 def test_half_a_mounting_is_refused() -> None:

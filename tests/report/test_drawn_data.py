@@ -27,17 +27,17 @@ from kcal.lens.difference import camera_difference
 from kcal.lens.rig import Origin
 from kcal.locate.siting import Site, siting_map
 from kcal.report import positions as siting_module
-from kcal.report.calibration import difference_figure
+from kcal.report.calibration import camera_pictures, difference_figure
 from kcal.report.figures import draw_arrows
 from kcal.report.positions import (
     _siting_marks,
     _siting_notes,
     budget_figure,
+    range_picture,
     siting_figure,
 )
 from kcal.report.rig import _above_sky, _edges, attitude_figure, rig_figure, stars_figure
 from kcal.report.verdict import RangeAnswer, Requirement
-from kcal.report.verdict_pictures import camera_pictures, range_picture
 
 
 def lines(axes: Axes, marker: str) -> np.ndarray[Any, Any]:
@@ -217,7 +217,7 @@ class TestVerdictPictures:
     @pytest.fixture(autouse=True)
     def _figures(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Figures in place of their PNG."""
-        monkeypatch.setattr("kcal.report.verdict_pictures.picture_bytes", lambda figure: figure)
+        monkeypatch.setattr("kcal.report.figures.picture_bytes", lambda figure: figure)
 
     def test_bars_are_shares_of_the_variance(self) -> None:
         needs = (Requirement(distance=1000.0, meters=50.0), Requirement(distance=5000.0, meters=500.0))

@@ -26,7 +26,7 @@ from kcal.locate.positions import map_places, region_rings
 from kcal.report.judge_camera import (
     _blur_finding,
     _blurred_share,
-    _camera_answer,
+    _camera_answers,
     _coverage_finding,
     _image_rms,
     _pose_findings,
@@ -45,8 +45,8 @@ from kcal.report.judge_rig import (
 )
 from kcal.report.map_page import _box, _content, _placing, _tile, _warp, arcs_within, local_image
 from kcal.report.pages import _caption, _correlations, camera_tables
+from kcal.report.positions import _PART_COLORS
 from kcal.report.verdict import RangeAnswer, Requirement, weighed_findings
-from kcal.report.verdict_pictures import _PART_COLORS
 from kcal.rig import RigCovariance
 
 CAMERA = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480), model="pinhole")
@@ -223,7 +223,7 @@ class TestAnswers:
     def test_a_range_by_two_cameras(self) -> None:
         """√2 Z² / (f B) for each pixel of either camera."""
         need = Requirement(distance=1000.0, meters=50.0)
-        parts = _camera_answer(CAMERA, need, 0.2, 0.5, 8.0, 0.3).parts
+        parts = _camera_answers(CAMERA, [need], 0.2, 0.5, 8.0, 0.3)[0].parts
         slope = math.sqrt(2) * 1e6 / (800 * 8)
         assert parts == pytest.approx({"marks": 0.3 * slope, "lenses": 0.2 * slope, FAULTS: 0.5 * slope})
 

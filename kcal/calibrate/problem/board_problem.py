@@ -296,9 +296,9 @@ class BoardProblem(SchurProblem[BoardState]):
         if self.readout is None:
             rotated = state.rotation @ flat
             return _Placed(flat, rotated, rotated + state.translation[..., None], None)
-        moved = self.readout.of_views(views).moved(state.motion, self._time[views], flat)
-        rotated = state.rotation @ moved.points
-        return _Placed(flat, rotated, rotated + state.translation[..., None] + moved.shift, moved.turn)
+        points, shift, turn = self.readout.of_views(views).moved(state.motion, self._time[views], flat)
+        rotated = state.rotation @ points
+        return _Placed(flat, rotated, rotated + state.translation[..., None] + shift, turn)
 
     def _imaged(self, state: BoardState, views: slice = ALL) -> _Imaged:
         """Corners of a state, with derivatives by all parameters but those of a field whose columns follow."""

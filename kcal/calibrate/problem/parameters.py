@@ -276,22 +276,6 @@ class FreeParameters:
         """For each unknown the index of the first parameter that follows it."""
         return tuple(self.indices[self.slots.index(slot)] for slot in range(len(self)))
 
-    def collapse(self, columns: Tensor, dim: int) -> Tensor:
-        """Derivatives by each unknown, from those by each parameter along `dim`: tied ones are added."""
-        parts = self.collapsed(columns, dim)
-        return parts[0] if len(parts) == 1 else torch.cat(parts, dim)
-
-    def collapsed(self, columns: Tensor, dim: int) -> tuple[Tensor, ...]:
-        """As `collapse`, in parts that are not yet joined: a copy of hundreds of columns takes long."""
-        if self._plain:
-            return (columns,)
-        if self.slots[:2] == (0, 0) and self.slots[1:] == tuple(range(len(self))):
-            # One focal length, as a rule.
-            return columns.narrow(dim, 0, 1) + columns.narrow(dim, 1, 1), columns.narrow(dim, 2, len(self) - 1)
-        shape = list(columns.shape)
-        shape[dim] = len(self)
-        return (columns.new_zeros(shape).index_add_(dim, torch.tensor(self.slots, device=columns.device), columns),)
-
     def expand(self, step: Tensor) -> Tensor:
         """A step of the unknowns (..., len) as a step of each parameter."""
         return step if self._plain else step[..., list(self.slots)]

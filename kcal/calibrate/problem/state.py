@@ -117,13 +117,16 @@ class Readout:
         """How far corners (N, 3) of the board, meters, are from its middle at most, in distances of the board."""
         return float((points - self.center).norm(dim=-1).max()) / self.distance
 
-    def moved(self, motion: Tensor, time: Tensor, points: Tensor) -> MovedBoard:
+    def moved(self, motion: Tensor, time: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Boards as they stand when their corners are read.
 
         Args:
             motion: (V, M) of each view: ω₁, s₁, ω₂, s₂ where views move, and heights of bending where the board bends.
             time: (V, N) of each corner.
             points: (3, N), or (V, 3, N) of each view, the board, meters.
+
+        Returns:
+            (V, 3, N) each: points turned in the board's frame, and their shift in the camera's, meters; ω of each.
         """
         points = points.expand(len(motion), *points.shape[-2:])
         turn = shift = torch.zeros_like(points)
@@ -133,7 +136,7 @@ class Readout:
             points = points + torch.linalg.cross(turn, points - self.center[:, None], dim=1)
         if self.bends is not None:
             points = points + torch.nn.functional.pad(motion[:, None, -BENDS:] @ self.bends, (0, 0, 2, 0))
-        return MovedBoard(points, self.distance * shift, turn)
+        return points, self.distance * shift, turn
 
     def columns_of(
         self, by_point: Tensor, rotation: Tensor, time: Tensor, points: Tensor, *, apart: bool = False
@@ -227,20 +230,6 @@ def motion_sigma(log_ratio: np.ndarray, variance: float) -> MotionSigma:
         variance: of the noise.
     """
     return MotionSigma(*(np.exp(log_ratio[:AMPLITUDES]) * np.sqrt(variance)).tolist())
-
-
-class MovedBoard(NamedTuple):
-    """Boards while they are read.
-
-    Attributes:
-        points: (V, 3, N) in the board's frame, turned, meters.
-        shift: (V, 3, N) of them in the camera's frame, meters.
-        turn: (V, 3, N) ω of each corner.
-    """
-
-    points: Tensor
-    shift: Tensor
-    turn: Tensor
 
 
 # What the problem of one camera is solved for: camera, board, poses and motions.

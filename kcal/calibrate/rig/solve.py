@@ -226,11 +226,10 @@ class RigOptions:
         if self.intrinsics not in ("fixed", "prior", "free"):
             raise InputError(f"intrinsics must be fixed, prior or free, got {self.intrinsics!r}")
         check_refraction(self.refraction, self.refraction_sigma)
-        if not 0 <= self.lens_change < math.inf or (self.lens_change and self.intrinsics != "prior"):
-            raise InputError(
-                f"lens_change must be a size in pixels, for intrinsics 'prior', got {self.lens_change} for "
-                f"{self.intrinsics!r}"
-            )
+        if not 0 <= self.lens_change < math.inf:
+            raise InputError(f"lens_change {self.lens_change}: pixels, not negative, are needed")
+        if self.lens_change and self.intrinsics != "prior":
+            raise InputError(f"lens_change {self.lens_change}: intrinsics 'prior' are needed, got {self.intrinsics!r}")
 
 
 @in_one_thread

@@ -137,7 +137,8 @@ def test_errors_are_as_large_as_predicted() -> None:
     unknowns = hybrid_unknowns(model)
     far = 1e6 * rays.T
     seen = project_components(far, camera.params.detach(), model, unknowns.indices)
-    columns = unknowns.collapse(seen.by_camera, -3).flatten(1).T
+    columns = torch.zeros(len(unknowns), *seen.by_camera.shape[1:]).double()
+    columns = columns.index_add(0, torch.tensor(unknowns.slots), seen.by_camera).flatten(1).T
     turn = step_rows(seen.by_point, far)[:3].flatten(1).T
     basis, _ = torch.linalg.qr(turn)
     error = (seen.pixels - pixels.T).flatten()
