@@ -258,9 +258,13 @@ def model_findings(
         findings.append(Finding("halves", "doubt", text, "take more views"))
     elif against is None:
         agree = _halves_agree(found.halves)
+        ratios = ", ".join(
+            f"{half.difference.ratio or 0.0:.1f} times (p {half.difference.probability or 0.0:.1g}, {half.label})"
+            for half in found.halves
+        )
         text = (
             f"cameras from halves of the views {'agree: they ' if agree else ''}differ by "
-            f"{_ratios(found.halves)} what the error bars predict{'' if agree else ': these may be too small'}"
+            f"{ratios} what the error bars predict{'' if agree else ': these may be too small'}"
         )
         findings.append(Finding("halves", "fine" if agree else "doubt", text, "" if agree else "take more views"))
     return findings, beyond
@@ -268,14 +272,6 @@ def model_findings(
 
 def _halves_agree(halves: Sequence[HalvesDifference]) -> bool:
     return all((half.difference.probability or 0.0) >= _AGREE for half in halves)
-
-
-def _ratios(halves: Sequence[HalvesDifference]) -> str:
-    """Differences of halves over what their error bars predict, each with its chance."""
-    return ", ".join(
-        f"{half.difference.ratio or 0.0:.1f} times (p {half.difference.probability or 0.0:.1g}, {half.label})"
-        for half in halves
-    )
 
 
 def fault_of_views(

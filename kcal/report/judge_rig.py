@@ -15,7 +15,6 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import FAULTS, Finding
-from kcal.lens.calibration import RigCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
@@ -303,7 +302,9 @@ def _doubts(rig: Rig, result: RigResult | None) -> list[Finding]:
         text = f"the lenses of {' and '.join(exact)} were taken as exact: their errors are in no error bar"
         action = "solve the rig from cameras with error bars, with --intrinsics prior"
         found.append(Finding("exact-lenses", "doubt", text, action))
-    variance = max(1.0 if result is None else result.variance, _largest_variance(record if result is None else result))
+    solved = record if result is None else result
+    known = [source.sigmas**2 for source in (solved.sources if solved else ()) if source.sigmas is not None]
+    variance = max([1.0 if result is None else result.variance, *known])
     if variance > _MOST_VARIANCE:
         text = (
             f"residuals are {math.sqrt(variance):.1f} times as large as their sigmas say: cameras, "
@@ -321,13 +322,6 @@ def _exact_lenses(rig: Rig, result: RigResult | None) -> tuple[str, ...]:
         return ()
     parts = zip(rig.names, rig.root[:, : sum(rig.sizes)].split(rig.sizes, 1), strict=True)
     return tuple(name for name, part in parts if not bool(part.any()))
-
-
-def _largest_variance(solved: RigResult | RigCalibration | None) -> float:
-    """Largest mean square of a source's residuals in their sigmas."""
-    sources = () if solved is None else solved.sources
-    known = [source.sigmas for source in sources if source.sigmas is not None]
-    return max((sigmas**2 for sigmas in known), default=0.0)
 
 
 def _pairs_compared(rig: Rig, result: RigResult | None, pairs: tuple[Tensor, Tensor] | None) -> Synchrony | None:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 import kcal.report.figures as figures
 from kcal.calibrate.rig.result import RigResult
-from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
 from kcal.locate.tabulate import middle_row_ends
 from kcal.skyline.attitude import SkylineAttitude
@@ -179,16 +178,13 @@ def _draw_items(axes: Axes, result: RigResult) -> None:
         if item.sigmas > limit:
             axes.text(limit * 0.99, row, f"{item.sigmas:.0f} ▸", ha="right", va="center", fontsize=7.5, color="white")
     axes.axvline(1.0, color=figures.INK, linewidth=0.9, linestyle=(0, (4, 3)))
-    axes.set_yticks(range(len(items)), [_label(item) for item in items], fontsize=7 if len(items) > 25 else 8.5)
+    labels = [dataclasses.replace(item, name=figures.shortened(item.name, 28)).label for item in items]
+    axes.set_yticks(range(len(items)), labels, fontsize=7 if len(items) > 25 else 8.5)
     axes.set(xlim=(0, limit), ylim=(len(items) - 0.4, -0.6), xlabel="residual in sigmas; 1 is typical")
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.tick_params(axis="y", length=0)
     shown = "" if len(items) == len(result.items) else f", the worst {len(items)} of {len(result.items)}"
     axes.set_title(f"Residuals by item{shown}", fontsize=9)
-
-
-def _label(item: ItemResidual) -> str:
-    return dataclasses.replace(item, name=figures.shortened(item.name, 28)).label
 
 
 def _notes(result: RigResult) -> list[str]:

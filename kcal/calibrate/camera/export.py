@@ -362,7 +362,9 @@ def _in_one_model(
 def _fit_each(camera: Camera, name: str, model: str | None) -> dict[LensModel, _Fitted]:
     """The camera in each model of a format that shows its whole image."""
     found, refused = {}, []
-    for kind in _richest([model] if model else FORMATS[name].models):
+    kinds = [LensModel.named(one) for one in ([model] if model else FORMATS[name].models)]
+    # The models that no other one of them contains.
+    for kind in (kind for kind in kinds if not any(other != kind and other.contains(kind) for other in kinds)):
         try:
             found[kind] = _in_model(camera, kind, name)
         except (InputError, DegenerateError) as error:
@@ -431,12 +433,6 @@ def _lost(cameras: Sequence[Camera], rig: Rig | None, known: CameraFormat, carri
         "mounting": rig is not None and (rig.mounting is not None or rig.origin is not None),
     }
     return tuple(what for what, there in found.items() if there)
-
-
-def _richest(models: Sequence[str]) -> list[LensModel]:
-    """The models that no other one of them contains."""
-    kinds = [LensModel.named(model) for model in models]
-    return [kind for kind in kinds if not any(other != kind and other.contains(kind) for other in kinds)]
 
 
 def _write_splines(

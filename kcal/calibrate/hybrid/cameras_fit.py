@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -408,7 +408,7 @@ def fit_cameras(
             known = board.prior_for(seen.board.points)
     each, alone = range(len(sets)), cast(Shape, "exact" if board == "exact" else "printed")
 
-    run = run or _one_by_one
+    run = run or (lambda function, tasks: ((i, function(*arguments)) for i, arguments in tasks.items()))
 
     def fit(tasks: dict[int, _Task]) -> dict[int, CameraFit]:
         """Fits of some cameras; each is told on as it ends."""
@@ -458,13 +458,6 @@ def fit_cameras(
         numbers = range(1 + max(camera.board for camera in cameras))
         boards = [_measured(k, sets, names, cameras, fitted) for k in numbers]
     return CamerasFit(cameras=tuple(cameras), boards=tuple(boards), lens=lens)
-
-
-def _one_by_one(
-    function: Callable[..., CameraFit], tasks: dict[int, tuple[Any, ...]]
-) -> Iterator[tuple[int, CameraFit]]:
-    for i, arguments in tasks.items():
-        yield i, function(*arguments)
 
 
 @in_one_thread

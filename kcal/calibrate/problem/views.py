@@ -367,12 +367,8 @@ class CameraViews(Views):
 
     def lens_problem(self, model: LensModel, terms: Sequence[Term] = ()) -> BoardProblem:
         """The least-squares problem of a lens model under the constraints, with their priors."""
-        terms = (*terms, *self.prior_terms(model))
+        terms = (*terms, *self.constraints.terms(model, self.prior_noise))
         return self.problem(model, self.constraints.free_parameters(model), terms=terms)
-
-    def prior_terms(self, model: LensModel) -> tuple[Term, ...]:
-        """The priors of the constraints."""
-        return self.constraints.terms(model, self.prior_noise)
 
     def with_noise_of(self, state: BoardState, model: LensModel) -> CameraViews:
         """The same with priors in proportion to the noise of a solution."""
