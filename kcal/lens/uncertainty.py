@@ -82,9 +82,7 @@ def pixel_covariance(
 
 
 @torch.no_grad()
-def pixel_errors(
-    camera: Camera, truth: Camera, places: Tensor, *, at: float = math.inf, grid: tuple[int, int] = (25, 17)
-) -> Tensor:
+def pixel_errors(camera: Camera, truth: Camera, places: Tensor, *, at: float = math.inf) -> Tensor:
     """Where a camera sees points minus where the true camera sees them: the errors that `pixel_covariance` predicts.
 
     The turn that no board determines is taken out in the same way.
@@ -94,7 +92,6 @@ def pixel_errors(
         truth: a single camera of the same image size.
         places: (N, 2) pixels of the camera.
         at: distance of the points, meters.
-        grid: columns and rows over which the turn is fitted.
 
     Returns:
         (N, 2) px; NaN where one of the two has no image.
@@ -113,7 +110,7 @@ def pixel_errors(
         seen, visible = truth.project(points)
         return torch.where((valid & visible)[:, None], pixels - seen, torch.nan)
 
-    everywhere = camera.grid(*grid).reshape(-1, 2)
+    everywhere = camera.grid(25, 17).reshape(-1, 2)
     away, (_, by_motion, good) = seen_apart(everywhere, math.inf), pixel_slopes(camera, everywhere, math.inf, [])
     good = good & away.isfinite().all(-1)
     turn = torch.linalg.lstsq(by_motion[good][..., :3].flatten(0, 1), away[good].reshape(-1, 1)).solution
@@ -212,12 +209,7 @@ _ROUNDING = 1e-12
 
 
 def carried_covariance(
-    camera: Camera,
-    substitute: Camera,
-    *,
-    misfit: float = 0.0,
-    width: Tensor | None = None,
-    grid: tuple[int, int] = (33, 25),
+    camera: Camera, substitute: Camera, *, misfit: float = 0.0, width: Tensor | None = None
 ) -> Tensor | None:
     """Covariance (5 + Q, 5 + Q) of the parameters of a camera that stands for another one; None if nothing is known.
 
@@ -233,7 +225,6 @@ def carried_covariance(
         substitute: a single camera of a parametric model, in the same frame.
         misfit: root mean square of the distance between both over the image, pixels.
         width: (5 + Q,) what limits the substitute's parameters otherwise; infinite, or None for all: nothing.
-        grid: columns and rows of the image on which changes are compared.
 
     Example:
         >>> from kcal.lens import CameraCalibration
@@ -255,7 +246,7 @@ def carried_covariance(
         for index in free:
             moved[:, wanted.index(names[index])] = half[:, index]
         return moved.T @ moved
-    rays, valid = camera.unproject(camera.grid(*grid).reshape(-1, 2))
+    rays, valid = camera.unproject(camera.grid(33, 25).reshape(-1, 2))
     own, _, seen = pixel_slopes(camera, rays, torch.inf, free)
     adjustable = [index for index, name in enumerate(wanted) if name != "skew"]
     theirs, _, shown = pixel_slopes(substitute, rays, torch.inf, adjustable)

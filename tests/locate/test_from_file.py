@@ -11,7 +11,8 @@ import torch
 from command_line import Command
 
 from kcal import InputError, Localizer, Origin, load_rig, save_rig
-from kcal.locate import range_sigmas, sites_of
+from kcal.locate.budget import range_sigmas
+from kcal.locate.siting import sites_of
 from kcal.rig import Mounting
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
@@ -60,7 +61,9 @@ def test_marks_have_the_noise_that_the_file_states(tmp_path: Path) -> None:
         read = load_rig(save_rig(rig, tmp_path / "rig.json"))
         assert [float(Localizer(read, weights=how).pixel_sigma) for how in (None, "all")] == [sigma, sigma]
         assert torch.equal(range_sigmas(read).total, range_sigmas(read, pixel_sigma=sigma).total)
-        assert sites_of(read) == sites_of(read, sigma)
+        station = Localizer(read).apart()
+        station.calibration = rig.calibration
+        assert sites_of(station) == sites_of(station, sigma)
         assert float(Localizer(read, pixel_sigma=0.1).pixel_sigma) == 0.1
 
 
