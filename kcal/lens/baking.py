@@ -367,8 +367,9 @@ def bake(camera: Camera, tolerance: float = 1e-3) -> LookupCamera:
     def pixel_errors(_: Tensor, pixels: Tensor, exact: Tensor) -> Tensor:
         return torch.linalg.vector_norm(pixels - exact, dim=-1)
 
+    seen = _chart_box(to_chart, image)
     inverse = _fit_table("unproject", to_chart, reprojection_errors, image, tolerance)
-    forward = _fit_table("project", to_pixels, pixel_errors, _chart_box(to_chart, image), tolerance)
+    forward = _fit_table("project", to_pixels, pixel_errors, seen, tolerance)
     return LookupCamera(
         size=camera.size,
         pixels_from_chart=forward.spline,
