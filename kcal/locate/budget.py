@@ -526,7 +526,7 @@ def check_ranges(
         >>> found.true, found.causes[0].name, round(found.causes[0].amount, 3)
         (False, 'yaw', 0.029)
     """
-    checked_rig(rig, pixel_sigma)
+    mark_sigma = checked_rig(rig, pixel_sigma)
     if len(rig) != 2:
         raise InputError(f"check_ranges: a rig of two cameras is needed, this one has {len(rig)}")
     names, pixels = tuple(marks.names), as_points("marks", marks.pixels, 2, rig.center)
@@ -540,7 +540,7 @@ def check_ranges(
     if not 0.0 < level < 1.0:
         raise InputError(f"level: a share between 0 and 1 is needed, got {level}")
     found = fit_pairs(
-        rig, pixels[:, 0], pixels[:, 1], marks.covariance_or(pixel_sigma), noise=pixel_sigma, by_camera=True
+        rig, pixels[:, 0], pixels[:, 1], marks.covariance_or(mark_sigma), noise=mark_sigma, by_camera=True
     )
     for name, status, fine in zip(names, found.status.tolist(), found.fitted.tolist(), strict=True):
         if not fine:

@@ -6,7 +6,7 @@ import math
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -544,7 +544,7 @@ def _draw_poses(axes: Axes, result: CameraCalibrationResult) -> None:
     rotation, translation = result.cam_from_board_rotation[used], result.cam_from_board_translation[used]
     tilts, distance = board_tilts(rotation).numpy(), translation.norm(dim=-1).numpy()
     roll = torch.atan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1]).numpy()
-    arrows = {"color": figures.ACCENT, "pivot": "mid", "scale": 26.0, "width": 0.005, "headwidth": 4.0}
+    arrows: Any = {"color": figures.ACCENT, "pivot": "mid", "scale": 26.0, "width": 0.005, "headwidth": 4.0}
     axes.quiver(distance, tilts, np.cos(roll), -np.sin(roll), **arrows)
     axes.axhspan(0.0, 15.0, color=figures.FAINT, alpha=0.2, linewidth=0)
     axes.set(xlabel="distance, m", ylabel="tilt, degrees", ylim=(0.0, max(50.0, 1.1 * float(tilts.max()))))

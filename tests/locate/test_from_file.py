@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 from command_line import Command
 
 from kcal import InputError, Localizer, Origin, load_rig, save_rig
+from kcal.locate import Marks, check_ranges
 from kcal.locate.budget import range_sigmas
 from kcal.locate.siting import sites_of
 from kcal.rig import Mounting
@@ -61,6 +63,9 @@ def test_marks_have_the_noise_that_the_file_states(tmp_path: Path) -> None:
         read = load_rig(save_rig(rig, tmp_path / "rig.json"))
         assert [float(Localizer(read, weights=how).pixel_sigma) for how in (None, "all")] == [sigma, sigma]
         assert torch.equal(range_sigmas(read).total, range_sigmas(read, pixel_sigma=sigma).total)
+        ranges = 0.99 / Localizer(read)(LEFT, RIGHT).inverse_range
+        check = partial(check_ranges, read, Marks.of_pair("ab", LEFT, RIGHT), ranges, 0.01 * ranges)
+        assert check().chi2 == check(pixel_sigma=sigma).chi2 != check(pixel_sigma=0.1).chi2
         station = Localizer(read).apart()
         station.calibration = rig.calibration
         assert sites_of(station) == sites_of(station, sigma)
