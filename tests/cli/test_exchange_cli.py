@@ -66,6 +66,7 @@ def test_a_change_is_told(tmp_path: Path, camera: Path) -> None:
     assert "no error bars" in run("diff", tmp_path / "new.json", tmp_path / "new.json")
 
 
+@pytest.mark.slow
 def test_a_fitted_lens_is_told_with_a_picture(tmp_path: Path, camera: Path) -> None:
     text = run("export", camera, "-o", tmp_path / "k.yaml", "--model", "pinhole", "--format", "kalibr",
                "--picture", tmp_path / "m.png")  # fmt: skip

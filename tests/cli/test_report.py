@@ -49,6 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
+@pytest.mark.slow
 def test_a_camera_is_judged_by_its_file_and_by_its_views(folder: Path) -> None:
     code, text = kcal("report", folder / "left.camera.json", "--require", "100m:10%,9km:1%")
     assert code == 3
@@ -69,6 +70,7 @@ def test_a_camera_is_judged_by_its_file_and_by_its_views(folder: Path) -> None:
         assert f'id="{name}"' in page
 
 
+@pytest.mark.slow
 def test_calibration_ends_with_3_where_what_is_required_is_not_met(folder: Path) -> None:
     words = ("calibrate", folder / "left.obs.json", "-o", folder / "again.json", "--model", "pinhole")
     code, text = kcal(*words, "--require", "200m:5%")

@@ -142,6 +142,7 @@ def test_from_survey_to_positions(site: Path, command: Command) -> None:
     assert len(json.loads((site / "out.geojson").read_text())["features"]) == 12
 
 
+@pytest.mark.slow
 def test_landmarks_from_geojson_and_a_requirement(site: Path, command: Command) -> None:
     rows = list(csv.DictReader((site / "survey.csv").open()))
     features = [
@@ -301,6 +302,7 @@ def test_marks_count_with_their_own_noise(site: Path) -> None:
     assert read.pixel_sigma == pytest.approx(0.2)
 
 
+@pytest.mark.slow
 def test_the_rig_file_states_the_noise_of_its_marks(site: Path, command: Command) -> None:
     marks = read_marks(site / "marks.csv")
     write_marks(site / "own.csv", marks._replace(covariance=0.2**2 * torch.eye(4).double().expand(12, 4, 4)))
@@ -356,6 +358,7 @@ def arguments(folder: Path, tracks: str = "tracks.csv") -> list[str]:
     return ["rig", *cameras, "--tracks", *files, "-o", str(folder / "rig.json")]
 
 
+@pytest.mark.slow
 def test_a_rig_from_a_drone(given: Path, command: Command) -> None:
     more = ["--positions", str(given / "gnss.csv"), "--baseline", "10.0+-0.02", "--intrinsics", "fixed"]
     result = command(*arguments(given), *more)
@@ -388,6 +391,7 @@ def scene_given(tmp_path: Path) -> list[str]:
     return ["rig", *cameras, "--scene", *(f"{name}.png" for name in names), "-o", str(tmp_path / "rig.json")]
 
 
+@pytest.mark.slow
 def test_a_rig_from_images_and_a_tape(scene_given: list[str], tmp_path: Path, command: Command) -> None:
     length = float(small_rig().baseline)
     result = command(*scene_given, f"--baseline {length:.4f}+-0.002")
@@ -426,6 +430,7 @@ def run_skyline(folder: Path, *options: str) -> tuple[int, str]:
     return result.exit_code, " ".join(f"{result.stdout} {result.stderr} {result.exception}".split())
 
 
+@pytest.mark.slow
 def test_a_station_from_its_skyline(files: Path) -> None:
     code, text = run_skyline(
         files, "--positions", str(files / "gnss.csv"), "--terrain", str(files / "dem.asc"), "--skyline",

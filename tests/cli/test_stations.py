@@ -74,6 +74,7 @@ def solve(folder: Path) -> None:
     assert all(name in text for name in NAMES)
 
 
+@pytest.mark.slow
 def test_four_cameras_are_solved_and_locate_what_some_of_them_saw(folder: Path) -> None:
     solve(folder)
     rig, truth = load_rig(folder / "rig.json"), ring(4, 5000.0)
@@ -133,6 +134,37 @@ def test_one_station_in_local_meters(folder: Path, tmp_path: Path, command: Comm
     assert abs(rows[0]["heading_deg"] - rows[1]["heading_deg"]) < 0.1
 
 
+Columns = Callable[[int, float, float, float], tuple[object, ...]]
+
+
+def surveyed(folder: Path, columns: Columns, *, flat: bool) -> Result:
+    """`kcal station` on landmarks with these columns: latitude, longitude, height, of each number and place.
+
+    Level ground has no other side, so that depths are told by landmarks at several heights.
+    """
+    origin = Origin(lat=43.32, lon=21.9, height=200.0)
+    camera = Camera.build(focal=(1400, 1400), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+    draw = torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5
+    points = draw * torch.tensor([30.0, 60.0, 0.0 if flat else 8.0]) + torch.tensor([0.0, 60.0, 0.0])
+    pixels, _ = camera.project((points - torch.tensor([0.0, 0.0, 6.0])) @ enu_from_cam(0.0, -8.0, 0.5))
+    save_camera(camera, folder / "cctv.camera.json")
+    marked = [f"p{i},cctv,{u:.3f},{v:.3f}" for i, (u, v) in enumerate(pixels.tolist())]
+    (folder / "marks.csv").write_text("\n".join(["name,camera,u,v", *marked]) + "\n")
+    places = enumerate(enu_to_geodetic(points, origin).tolist())
+    lines = [",".join(map(str, (f"p{i}", *columns(i, *place), 0.05))) for i, place in places]
+    (folder / "survey.csv").write_text("\n".join(["name,lat,lon,height,sigma", *lines]) + "\n")
+    given = [str(folder / "cctv.camera.json"), "--landmarks", str(folder / "survey.csv")]
+    return CliRunner().invoke(
+        app, ["station", *given, "--marks", str(folder / "marks.csv"), "-o", str(folder / "rig.json")]
+    )
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_a_survey_as_it_should_be(tmp_path: Path, flat: bool) -> None:
+    assert surveyed(tmp_path, lambda i, *place: place, flat=flat).exit_code == 0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("columns", "text"),
     [
@@ -157,31 +189,11 @@ def test_one_station_in_local_meters(folder: Path, tmp_path: Path, command: Comm
 )
 def test_exchanged_columns_of_a_survey(
     tmp_path: Path,
-    columns: Callable[[int, float, float, float], tuple[object, ...]],
+    columns: Columns,
     text: str,
 ) -> None:
     """What is wrong with the table is said, whether landmarks contradict each other or put the camera upside down."""
-    origin = Origin(lat=43.32, lon=21.9, height=200.0)
-    camera = Camera.build(focal=(1400, 1400), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
-    # Level ground has no other side, so that depths are told by landmarks at several heights.
-    flat = "downward" not in text
-    draw = torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5
-    points = draw * torch.tensor([30.0, 60.0, 0.0 if flat else 8.0]) + torch.tensor([0.0, 60.0, 0.0])
-    pixels, _ = camera.project((points - torch.tensor([0.0, 0.0, 6.0])) @ enu_from_cam(0.0, -8.0, 0.5))
-    save_camera(camera, tmp_path / "cctv.camera.json")
-    marked = [f"p{i},cctv,{u:.3f},{v:.3f}" for i, (u, v) in enumerate(pixels.tolist())]
-    (tmp_path / "marks.csv").write_text("\n".join(["name,camera,u,v", *marked]) + "\n")
-
-    def solved(change: Callable[[int, float, float, float], tuple[object, ...]]) -> Result:
-        places = enumerate(enu_to_geodetic(points, origin).tolist())
-        lines = [",".join(map(str, (f"p{i}", *change(i, *place), 0.05))) for i, place in places]
-        (tmp_path / "survey.csv").write_text("\n".join(["name,lat,lon,height,sigma", *lines]) + "\n")
-        given = [str(tmp_path / "cctv.camera.json"), "--landmarks", str(tmp_path / "survey.csv")]
-        more = ["--marks", str(tmp_path / "marks.csv"), "-o", str(tmp_path / "rig.json")]
-        return CliRunner().invoke(app, ["station", *given, *more])
-
-    assert solved(lambda i, *place: place).exit_code == 0
-    wrong = solved(columns)
+    wrong = surveyed(tmp_path, columns, flat="downward" not in text)
     if "may be" in text:  # level ground looks alike from below: it is said, and who hangs a camera so has its place
         assert wrong.exit_code == 0
         assert text in wrong.output.replace("\n", " ")
@@ -190,6 +202,7 @@ def test_exchanged_columns_of_a_survey(
     assert text in str(wrong.exception)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("folder", "camera", "text"),
     [("collinear", "cam", "nearly in one line"), ("mirror", "cctv", "latitude and longitude are exchanged")],
@@ -223,6 +236,7 @@ def test_surveys_of_strangers(kcal_data: Path, tmp_path: Path, folder: str, came
         assert abs(value - true) < off
 
 
+@pytest.mark.slow
 def test_messages(folder: Path) -> None:
     solve(folder)
     three = [f"{name}.camera.json" for name in NAMES[:3]]
@@ -289,6 +303,7 @@ def boards_of(rig: Rig, folder: Path) -> list[str]:
     return files
 
 
+@pytest.mark.slow
 def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: Path) -> None:
     camera = [
         Camera.build(focal=(1600 + c, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
@@ -330,6 +345,7 @@ def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: 
         run(tmp_path, "rig", *three, "--scene", "mill.png", "mast.png", "-o", "rig.json")
 
 
+@pytest.mark.slow
 def test_a_rig_of_four_is_judged(folder: Path, command: Command) -> None:
     cameras = [f"{name}.camera.json" for name in NAMES]
     given = ["--landmarks", "survey.csv", "--marks", "marks.csv", "-o", "rig.json"]

@@ -44,6 +44,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_drift_is_found_told_and_drawn(site: Path, command: Command) -> None:
     history, picture = site / "h.csv", site / "p.png"
     words = [str(site / name) for name in ("rig.json", "left", "right")]
@@ -226,6 +227,7 @@ def test_wrong_words(tmp_path: Path, words: list[str], message: str, monkeypatch
     assert message in " ".join((found.output + str(found.exception)).split())
 
 
+@pytest.mark.slow
 def test_videos_are_watched_too_and_continue(tmp_path: Path, command: Command) -> None:
     pytest.importorskip("av")
     from tests.helpers.video_scenes import write_video

@@ -319,6 +319,7 @@ def capture(folder: Path, name: str, points: torch.Tensor, seed: int) -> Path:
     return observe(pixels, board=BOARD, size=SIZE).save(folder / f"{name}.obs.json")
 
 
+@pytest.mark.slow
 def test_one_board(tmp_path: Path) -> None:
     points = printed_points(BOARD, 3)
     output, picture = tmp_path / "plate.board.json", tmp_path / "plate.png"

@@ -200,14 +200,13 @@ class TestSigmaTells:
             assert abs(float(values.mean()) - true) < 4.5 * (variance / 60) ** 0.5, name
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("seed", [1, 2])
-    def test_more_coefficients_than_the_lens_has(self, seed: int) -> None:
+    def test_more_coefficients_than_the_lens_has(self) -> None:
         """Trap 2: 8 and 14 coefficients on a lens of five fit better and know less, and σ or a warning says so.
 
         4 σ holds but for 6e-5 of all captures, for each of four parameters.
         """
         truth = camera()
-        pixels = pixels_of(truth, motions(truth, 14, seed), noise=0.2, seed=seed)
+        pixels = pixels_of(truth, motions(truth, 14, 1), noise=0.2, seed=1)
         for model in ("opencv5", "opencv8", "opencv14"):
             result = solve(pixels, model)
             off = {
