@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -26,7 +27,7 @@ from kcal.calibrate.batch.jobs import (
     sharing_jobs,
 )
 from kcal.calibrate.batch.results import Results, Task, calibrate_batch, run_tasks
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, FileError, InputError
@@ -39,8 +40,12 @@ SEEN = {
     name: observe(pixels_of(camera(), motions(camera(), 5, seed), noise=0.1, seed=seed))
     for seed, name in enumerate(NAMES)
 }
-RESULTS = {name: calibrate_camera(SEEN[name], CalibrationOptions(model="opencv4")) for name in NAMES}
-TOGETHER = {name: calibrate_camera(SEEN[name], CalibrationOptions(model="pinhole")) for name in NAMES}
+
+
+@functools.cache
+def solved(model: str) -> dict[str, CameraCalibrationResult]:
+    """As if cameras were alone (opencv4), and with what others tell of their board (pinhole)."""
+    return {name: calibrate_camera(SEEN[name], CalibrationOptions(model=model)) for name in NAMES}
 
 
 class Here:
@@ -74,16 +79,16 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[CameraJob]:
         return Detected(size=SEEN["east"].image_size, pixels=view.pixels)
 
     def calibrate(seen: Observations, name: str, model: str, options: BatchOptions) -> Calibrated:
-        return calibrated(RESULTS[name], name)
+        return calibrated(solved("opencv4")[name], name)
 
     def again(seen: Observations, options: BatchOptions) -> Any:
-        return RESULTS[name_of(seen)]
+        return solved("opencv4")[name_of(seen)]
 
     def sharing(alone: list[Any], options: CalibrationOptions, *, one_type: bool, run: Callable[..., Any]) -> list[Any]:
         assert (options.model, one_type) == ("hybrid", False)
-        assert alone == [RESULTS["east"], RESULTS["west"]]
+        assert alone == [solved("opencv4")["east"], solved("opencv4")["west"]]
         assert dict(run(divmod, {0: (7, 2), 1: (9, 4)})) == {0: (3, 1), 1: (2, 1)}
-        return [TOGETHER["east"], TOGETHER["west"]]
+        return [solved("pinhole")["east"], solved("pinhole")["west"]]
 
     monkeypatch.setattr(module, "detect_image", detect)
     monkeypatch.setattr(module, "calibrate_observations", calibrate)
@@ -115,7 +120,7 @@ def test_cameras_that_share_a_board_are_calibrated_together(jobs: list[CameraJob
     results, here, advanced = together(jobs, tmp_path / "out", alone)
     assert len(advanced) == pieces(jobs) == 15 + 3 + 2
     for name in NAMES:
-        wanted = RESULTS if name == "lone" else TOGETHER
+        wanted = solved("opencv4") if name == "lone" else solved("pinhole")
         kept = load_camera(tmp_path / "out" / f"{name}.camera.json")
         torch.testing.assert_close(kept.params, wanted[name].camera.params, rtol=1e-14, atol=0)
     assert here.done.count("again") == 2
@@ -143,20 +148,24 @@ def test_cameras_that_cannot_be_calibrated_together_stay_alone(
         assert "calibrated alone, without what other cameras tell of the board: no common shape" in row.warnings
     assert "calibrated alone" not in rows[2].warnings
     monkeypatch.undo()
-    assert torch.equal(load_camera(tmp_path / "out" / "east.camera.json").params, RESULTS["east"].camera.params)
+    assert torch.equal(
+        load_camera(tmp_path / "out" / "east.camera.json").params, solved("opencv4")["east"].camera.params
+    )
 
 
 def test_a_camera_that_failed_shares_nothing(
     jobs: list[CameraJob], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def calibrate(seen: Observations, name: str, model: str, options: BatchOptions) -> Calibrated:
-        return Calibrated(error="no") if name == "west" else calibrated(RESULTS[name], name)
+        return Calibrated(error="no") if name == "west" else calibrated(solved("opencv4")[name], name)
 
     monkeypatch.setattr(module, "calibrate_observations", calibrate)
     results, here, _ = together(jobs, tmp_path / "out")
     assert "again" not in here.done
     assert [row.status for row in results.rows()] == ["ok", "failed", "ok"]
-    assert torch.equal(load_camera(tmp_path / "out" / "east.camera.json").params, RESULTS["east"].camera.params)
+    assert torch.equal(
+        load_camera(tmp_path / "out" / "east.camera.json").params, solved("opencv4")["east"].camera.params
+    )
 
 
 def test_a_whole_batch(jobs: list[CameraJob], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,7 +187,7 @@ def test_a_whole_batch(jobs: list[CameraJob], tmp_path: Path, monkeypatch: pytes
         table = list(csv.DictReader(file))
     assert [row["camera"] for row in table] == list(NAMES)
     assert [(row["images"], row["views"], row["failures"]) for row in table] == [("5", "5", "0")] * 3
-    lone = RESULTS["lone"]
+    lone = solved("opencv4")["lone"]
     assert float(table[2]["rms"]) == pytest.approx(lone.rms, rel=1e-5)
     for column, number in (("fx", 0), ("fy", 1), ("cx", 2), ("cy", 3)):
         assert float(table[2][column]) == pytest.approx(float(lone.camera.params[number]), rel=1e-5)
