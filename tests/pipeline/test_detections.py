@@ -285,7 +285,7 @@ def test_detections() -> None:
         ([1], "left and right"),
         ({"left": [], "right": []}, "needs a time"),
         ({"time": 1, "left": [], "right": [], "more": 1}, "may have only"),
-        ({"time": "1", "left": [], "right": []}, "time"),
+        ({"time": "1", "left": [], "right": []}, r"time .seconds"),
         ({"time": 1, "left": [[1]], "right": [[1, 2]]}, "left: rows of 2"),
         ({"time": 1, "left": [[1, True]], "right": [[1, 2]]}, "left: rows of 2"),
         ({"time": 1, "left": [[1, 2]], "right": []}, "right"),
