@@ -174,7 +174,7 @@ def read_colmap(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
 
     Poses are those of the rig, in `rigs.txt` or `rigs.bin` beside the file or in the database, if one has all cameras.
     """
-    binary, beside = path.suffix.lower() == ".bin", path.with_name(path.name.replace("cameras", "rigs"))
+    binary, beside = path.suffix.lower() == ".bin", path.with_name(f"rigs{path.suffix}")
     notes, rigs = list[str](), Rigs()
     if read_head(path, len(SQLITE)) == SQLITE:
         entries, rigs = _from_database(path, notes)

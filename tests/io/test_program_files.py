@@ -123,6 +123,11 @@ def test_rigs_of_colmap_are_read(tmp_path: Path, kind: str) -> None:
     assert any("taken as meters (--unit)" in note for note in unsaid)
 
 
+def test_a_colmap_rig_of_any_name_is_read_again(tmp_path: Path) -> None:
+    export_cameras(three(), tmp_path / "site.txt", format="colmap")
+    assert len(import_cameras(tmp_path / "site.txt", format="colmap").poses) == 3
+
+
 def test_a_rig_that_lacks_a_camera_has_no_poses(tmp_path: Path) -> None:
     path = colmap_files(tmp_path)["text"]
     rigs = path.with_name("rigs.txt")
