@@ -20,6 +20,7 @@ from kcal.lens.pose import step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
 from kcal.lens.rig import Rig
 from kcal.locate.budget import RangeSigmas, range_sigmas, station_sigmas
+from kcal.locate.stereo import checked_sigma
 from kcal.locate.views import fit_pairs
 from kcal.report.judge_camera import stored_findings
 from kcal.report.verdict import RangeAnswer, Requirement, Verdict, weighed_findings
@@ -144,7 +145,7 @@ def rig_verdict(
     rig: Rig,
     requirements: Sequence[Requirement] = (),
     *,
-    mark_sigma: float = 0.3,
+    mark_sigma: float | None = None,
     result: RigResult | None = None,
     pairs: tuple[Tensor, Tensor] | None = None,
     unpaired: str = "",
@@ -160,7 +161,7 @@ def rig_verdict(
         rig: with its covariance; of two cameras, or of any number with its `root`: then ranges are those from each
             camera to objects that another one sees, where they are worst.
         requirements: ranges, and how well they must be known.
-        mark_sigma: noise of a mark along each axis, px.
+        mark_sigma: noise of a mark along each axis, px; if left out, as in `Localizer`.
         result: as it was solved, for its warnings and its pairs of boards.
         pairs: otherwise, corners of the board (N, 3) in meters, and pixels (P, 2, N, 2) of pairs of views.
         unpaired: why there are no pairs, where there should be.
@@ -177,6 +178,7 @@ def rig_verdict(
         >>> [answer.ok for answer in verdict.answers], verdict.reason
         ([True, False], 'at 5 km the range is known to ±6.8 %; 5 % are required; most of it is from relative pose')
     """
+    mark_sigma = checked_sigma(mark_sigma, rig)
     findings = [*_inherited(rig, cameras), *_own_findings(rig, result)]
     if rig.is_pair:
         compared = _pairs_compared(rig, result, pairs)

@@ -15,6 +15,7 @@ from kcal import InputError, Localizer, Origin, load_rig, save_rig
 from kcal.locate import Marks, check_ranges
 from kcal.locate.budget import range_sigmas
 from kcal.locate.siting import sites_of
+from kcal.report import rig_verdict
 from kcal.rig import Mounting
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample-rig.json"
@@ -70,6 +71,7 @@ def test_marks_have_the_noise_that_the_file_states(tmp_path: Path) -> None:
         station.calibration = rig.calibration
         assert sites_of(station) == sites_of(station, sigma)
         assert float(Localizer(read, pixel_sigma=0.1).pixel_sigma) == 0.1
+        assert f"with marks to {sigma:g} px" in rig_verdict(read).basis
 
 
 def test_half_a_mounting_is_refused() -> None:
