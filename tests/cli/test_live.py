@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from command_line import at_moment
 from track_scenes import ORIGIN, seen_by, tracked_site
 from typer.testing import CliRunner
 
@@ -65,23 +66,15 @@ def test_the_whole_job(folder: Path) -> None:
     assert float(rows[-2]["north_m"]) == pytest.approx(150.0, rel=0.02)
 
 
-def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sigterm_ends_it_and_the_next_run_continues(folder: Path) -> None:
     live(folder, "--clock-sigma", "0.1")
     whole = (folder / "tracks.csv").read_bytes()
     for path in folder.glob("tracks.csv*"):
         path.unlink()
     before = signal.getsignal(signal.SIGTERM)
-    write = Stream._write
-
-    def terminated(self: Stream, *what: object) -> None:
-        write(self, *what)  # type: ignore[arg-type]
-        if self.counts.moments == 7:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr(Stream, "_write", terminated)
-    assert "7 moments, 8 positions" in live(folder, "--clock-sigma", "0.1")
+    with at_moment(7):
+        assert "7 moments, 8 positions" in live(folder, "--clock-sigma", "0.1")
     assert signal.getsignal(signal.SIGTERM) is before
-    monkeypatch.setattr(Stream, "_write", write)
     assert "continuing after 7 moments" in live(folder, "--clock-sigma", "0.1")
     assert (folder / "tracks.csv").read_bytes() == whole
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import csv
-import os
 import shutil
-import signal
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
+from command_line import at_moment, terminate
 
 pytest.importorskip("av", reason="the extra `video` is not installed")
 from rtsp_server import RtspCamera
@@ -23,7 +22,6 @@ from waiting import wait_for
 
 from kcal import FileError, InputError, Origin, Rig, save_rig
 from kcal.cli.main import app
-from kcal.pipeline.stream import Stream
 from kcal.threads import Handover
 
 FRAMES, LATE = 14, 0.03
@@ -80,23 +78,19 @@ def test_positions_and_clock_are_right_within_their_sigmas(folder: Path) -> None
 
 
 @pytest.mark.slow
-def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sigterm_ends_it_and_the_next_run_continues(folder: Path) -> None:
     live(folder, "--clock-offset", str(LATE))
     whole = (folder / "tracks.csv").read_bytes()
     for path in folder.glob("tracks.csv*"):
         path.unlink()
-    write = Stream._write
     left_by_a_crash: dict[Path, bytes] = {}
 
-    def terminated(self: Stream, *what: object) -> None:
-        write(self, *what)  # type: ignore[arg-type]
-        if self.counts.moments == 7:
-            left_by_a_crash.update((path, path.read_bytes()) for path in folder.glob("tracks.csv*"))
-            os.kill(os.getpid(), signal.SIGTERM)
+    def terminated() -> None:
+        left_by_a_crash.update((path, path.read_bytes()) for path in folder.glob("tracks.csv*"))
+        terminate()
 
-    monkeypatch.setattr(Stream, "_write", terminated)
-    assert "7 moments, 8 positions" in live(folder, "--clock-offset", str(LATE))
-    monkeypatch.setattr(Stream, "_write", write)
+    with at_moment(7, terminated):
+        assert "7 moments, 8 positions" in live(folder, "--clock-offset", str(LATE))
     told = live(folder, "--clock-offset", str(LATE))
     assert "continuing after 7 moments" in told
     # The first left frame is earlier than all right ones.
@@ -110,7 +104,7 @@ def test_sigterm_ends_it_and_the_next_run_continues(folder: Path, monkeypatch: p
 
 
 @pytest.mark.slow
-def test_three_videos_of_three_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_three_videos_of_three_cameras(tmp_path: Path) -> None:
     """The third camera stops in the middle and names stay; what SIGTERM interrupts is continued to the same table."""
     pair = small_rig()
     camera, north = pair.left, torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -148,16 +142,8 @@ def test_three_videos_of_three_cameras(tmp_path: Path, monkeypatch: pytest.Monke
         assert (np.abs(found - true[np.abs(true - found).sum(1).argmin()]) < 3.5 * sigma).all()
     for path in tmp_path.glob("tracks.csv*"):
         path.unlink()
-    write = Stream._write
-
-    def terminated(self: Stream, *what: object) -> None:
-        write(self, *what)  # type: ignore[arg-type]
-        if self.counts.moments == 5:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr(Stream, "_write", terminated)
-    run()
-    monkeypatch.setattr(Stream, "_write", write)
+    with at_moment(5):
+        run()
     assert "continuing after 5 moments" in run()
     assert (tmp_path / "tracks.csv").read_bytes() == whole
 
@@ -269,18 +255,10 @@ def slow_spots(image: np.ndarray) -> np.ndarray:
 def test_two_rtsp_streams_whose_newest_frames_are_taken(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = small_rig()
     table = [film(rig, side, [1.0] * 7) for side in (0, 1)]
-    write = Stream._write
-
-    def terminated(self: Stream, *what: object) -> None:
-        write(self, *what)  # type: ignore[arg-type]
-        if self.counts.moments == 5:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr(Stream, "_write", terminated)
     monkeypatch.setattr("kcal.pipeline.video_source.Handover", Pairs)
     began = time.time()
     cameras = [RtspCamera(lambda when, side=side: table[side][round(10 * when) % 7], 10.0) for side in (0, 1)]
-    with cameras[0], cameras[1]:
+    with cameras[0], cameras[1], at_moment(5):
         videos = [camera.address for camera in cameras]
         command = ["live", str(folder / "rig.json"), *videos, "--detector", f"{__name__}:slow_spots"]
         done = CliRunner().invoke(app, [*command, "-o", str(folder / "tracks.csv")], catch_exceptions=False)

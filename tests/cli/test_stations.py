@@ -187,11 +187,7 @@ def test_a_survey_as_it_should_be(tmp_path: Path, flat: bool) -> None:
     ],
     ids=["exchanged", "sign", "depths", "some", "ddmm", "dms", "height"],
 )
-def test_exchanged_columns_of_a_survey(
-    tmp_path: Path,
-    columns: Columns,
-    text: str,
-) -> None:
+def test_exchanged_columns_of_a_survey(tmp_path: Path, columns: Columns, text: str) -> None:
     """What is wrong with the table is said, whether landmarks contradict each other or put the camera upside down."""
     wrong = surveyed(tmp_path, columns, flat="downward" not in text)
     if "may be" in text:  # level ground looks alike from below: it is said, and who hangs a camera so has its place

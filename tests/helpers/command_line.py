@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import pytest
 
@@ -50,3 +55,24 @@ class Command:
 def contents() -> dict[Path, bytes]:
     """All files and folders below the working folder."""
     return {path: path.read_bytes() if path.is_file() else b"" for path in Path().rglob("*")}
+
+
+def terminate() -> None:
+    """As a service manager ends this process."""
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+@contextmanager
+def at_moment(number: int, act: Callable[[], None] = terminate) -> Iterator[None]:
+    """Do something right after `kcal live` has written so many moments."""
+    from kcal.pipeline.stream import Stream
+
+    write = Stream._write
+
+    def written(self: Any, *what: Any) -> None:
+        write(self, *what)
+        if self.counts.moments == number:
+            act()
+
+    with patch.object(Stream, "_write", written):
+        yield
