@@ -274,15 +274,16 @@ def first_meeting(
         along: of distances (M, K) or (M,) and the numbers (M,) of lines: the places (..., 3) on these.
         above: height of places (..., 3) above the ground; NaN where that is not known.
         count: N lines.
-        distances: (K,) increasing.
+        distances: (K,) increasing from that of the camera.
     """
     parts = []
     for rows in torch.arange(count).split(_ROWS):
         heights = above(along(distances.expand(len(rows), -1), rows))
-        # The first place that is not above known ground ends the search.
+        # The first place that is not above known ground ends the search, but not one where a raster buries the camera.
         ended = ~(heights > 0)
+        buried, ended[:, 0] = ended[:, 0].clone(), False
         first = torch.where(ended.any(1), ended.to(torch.int8).argmax(1), 0)
-        met = ended.any(1) & torch.isfinite(heights.gather(1, first[:, None])[:, 0]) & (first > 0)
+        met = ended.any(1) & torch.isfinite(heights.gather(1, first[:, None])[:, 0]) & (first > buried)
         parts.append((distances[first], distances[(first - 1).clamp_min(0)], met))
     far, near, met = (torch.cat(part) for part in zip(*parts, strict=True)) if parts else (torch.zeros(0),) * 3
     rows, met = torch.arange(count), met.bool()
@@ -385,7 +386,7 @@ def _ground_ahead(
 
     # In equal steps, or in growing ones over level ground.
     step = getattr(ground, "cell_m", None)
-    distances = torch.arange(step, _FARTHEST + step, step, dtype=torch.float64) if step else _GROWING
+    distances = torch.arange(0.0, _FARTHEST + step, step, dtype=torch.float64) if step else _GROWING
     found = first_meeting(along, above, len(wanted), distances)
     met = torch.zeros_like(alone)
     met[wanted] = found.met

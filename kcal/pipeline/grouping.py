@@ -438,7 +438,7 @@ def _pairs_of_line(content: dict[str, Any], pixel_sigma: float) -> Moment:
     left, right = (_table(content[side], side, 2) for side in ("left", "right"))
     count = len(left)
     stamp = content["time"]
-    time = _table([stamp if isinstance(stamp, list) else [stamp, stamp]], "time (seconds; of the left and right image, if they differ)", 2)
+    time = _table([stamp if isinstance(stamp, list) else [stamp, stamp]], "time (seconds, or those of both images)", 2)
     sigma = _table([[content.get("sigma", pixel_sigma)]], "sigma", 1)
     if not bool(sigma > 0):
         raise InputError(f"sigma: a positive number of pixels is needed, got {float(sigma)}")

@@ -132,6 +132,17 @@ def test_a_ridge_hides_what_is_behind_it(tmp_path: Path) -> None:
     assert float(plain.enu[1, 1]) == pytest.approx(1000.0, rel=0.01)
 
 
+def test_ground_in_the_first_cell_is_found(tmp_path: Path) -> None:
+    """Of a coarse raster, in cells of a kilometer; nothing where it buries the camera."""
+    (tmp_path / "flat.asc").write_text(
+        "ncols 9\nnrows 9\nxllcorner 72.83\nyllcorner 19.03\ncellsize 0.01\n" + ("10 " * 9 + "\n") * 9
+    )
+    pixels = pixels_of(stands(), torch.tensor([[200.0, 250.0, -50.0]]).double())
+    flat = on_ground(stands(), pixels, terrain(tmp_path / "flat.asc"), 0.3)
+    torch.testing.assert_close(flat.enu, on_ground(stands(), pixels, level_ground(10.0), 0.3).enu, rtol=0, atol=1e-3)
+    assert on_ground(stands(), pixels, terrain(tmp_path / "flat.asc", 51.0), 0.3).status.tolist() == [6]
+
+
 def test_unknown_ground_is_not_guessed(tmp_path: Path) -> None:
     """Over the ridge, into the hole of the raster."""
     ground = terrain(raster_file(tmp_path))
