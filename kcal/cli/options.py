@@ -9,6 +9,7 @@ the options that are its fields. One whose type is a dictionary may be repeated,
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import difflib
 import functools
@@ -409,16 +410,11 @@ class Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Show all options and stop, if that was asked for."""
         if "--help-all" in args and self.more:
-            shown, self.epilog = self.epilog, None
-            try:
-                for param in self.more:
-                    param.hidden = False  # type: ignore[attr-defined]
-                text = self.get_help(ctx)
-            finally:
-                for param in self.more:
-                    param.hidden = True  # type: ignore[attr-defined]
-                self.epilog = shown
-            if text:
+            whole = copy.deepcopy(self)
+            whole.epilog = None
+            for param in whole.more:
+                param.hidden = False  # type: ignore[attr-defined]
+            if text := whole.get_help(ctx):
                 print(text)
             ctx.exit()
         words = ["--help" if word == "--help-all" else word for word in args]

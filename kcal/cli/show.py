@@ -19,11 +19,10 @@ import pydantic
 import kcal
 import kcal.report.shown as shown
 from kcal.cli import inputs, kinds, rooms
-from kcal.cli.console import err, out, print_table, print_wrote
+from kcal.cli.console import err, out, print_table, print_wrote, tell
 from kcal.cli.inputs import pixel_sigma_and_source
 from kcal.cli.locate import LocateOptions, counts_text, pair_localizer, refuse_of_pairs
 from kcal.cli.options import Kind, Only
-from kcal.cli.rig import print_stands
 from kcal.errors import FileError
 from kcal.file_kind import file_kind
 from kcal.files import read_bytes
@@ -51,21 +50,18 @@ def show_command(file: Annotated[Path, inputs.SHOWN]) -> None:
     if content["kcal"] == "observations":
         _print(shown.observations_blocks(kcal.Observations.load(file)))
         return
-    if content["kcal"] == "rig" and (content.get("origin") or len(content.get("names") or "12") != 2):
-        rig = kcal.load_rig(file)
-        _print(itertools.chain(*(shown.camera_blocks(*shown.derived_camera(camera)) for camera in rig.each), [""]))
-        print_stands(rig)
-        _print(shown.stations_blocks(rig))
-        return
-    if (written := _as_written(content)) is not None:
+    of_pair = not content.get("origin") and len(content.get("names") or "12") == 2
+    if of_pair and (written := _as_written(content)) is not None:
         cameras, pose = written
+        _print(itertools.chain(*itertools.starmap(shown.camera_blocks, cameras)))
+        _print(shown.pose_blocks(*pose) if pose else [])
     elif content["kcal"] == "camera":
-        cameras, pose = [shown.derived_camera(kcal.load_camera(file))], None
+        _print(shown.camera_blocks(*shown.derived_camera(kcal.load_camera(file))))
     else:
-        cameras, pose = shown.derived_rig(kcal.load_rig(file))
-    _print(
-        itertools.chain(*(shown.camera_blocks(*camera) for camera in cameras), shown.pose_blocks(*pose) if pose else [])
-    )
+        rig = kcal.load_rig(file)
+        _print(shown.rig_blocks(rig))
+        if not rig.is_pair:
+            tell(cameras=shown.stands(rig)[1])
 
 
 def _print(blocks: Iterable[str | list[list[str]]]) -> None:
