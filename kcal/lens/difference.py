@@ -12,7 +12,7 @@ from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import fit_turn, rotation_between, seen_turned
 from kcal.lens.projection import FAR
-from kcal.lens.uncertainty import pixel_covariance, pixel_slopes
+from kcal.lens.uncertainty import largest_sigma, pixel_covariance, pixel_slopes
 from kcal.texts import brief, length_text, number_text, range_text
 
 # How far pixels are shifted, over an image.
@@ -243,7 +243,7 @@ def _judged(
     if not roots:
         return None, None, None
     spread = torch.cat(roots, -1)
-    sigma = torch.linalg.matrix_norm(spread, ord=2)
+    sigma = largest_sigma(spread @ spread.mT)
     weighted = (root * spread).flatten(0, 1)
     gram = weighted.T @ weighted
     expected, squared = float(gram.trace()), float(gram.square().sum())

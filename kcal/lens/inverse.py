@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -159,6 +160,8 @@ _RINGS = 16
 # The image of the region's edge is known at 1024 directions only. A target this much farther out may still be inside:
 # it is tried at all, and it is tried again along the line from the axis.
 _TRIED, _TRIED_AGAIN = 1.0001, 1.00001
+# Share by which the edge's distance may change from one of these directions to the next, to be interpolated.
+_STEEP = 0.01
 # What has no image is put there. Where the edge has none, by rounding, it is taken for so many times the farthest.
 _FAR, _BEYOND = 1e150, 1.1
 
@@ -187,7 +190,8 @@ def solve_safeguarded(
         model: the lens model.
         region: of the lens.
     """
-    shape = torch.broadcast_shapes(valid.shape, (*coefficients.shape[:-1], valid.shape[-1]))
+    # That of torch loads all of sympy.
+    shape = np.broadcast_shapes(valid.shape, (*coefficients.shape[:-1], valid.shape[-1]))
     lead, count = shape[:-1], shape[-1]
     cameras = torch.Size(lead).numel()
     x, y, valid, target_x, target_y, tolerance = (
@@ -255,10 +259,15 @@ def _edge_fraction(x: Tensor, y: Tensor, edge_x: Tensor, edge_y: Tensor) -> Tens
     lost = reach >= _FAR
     farthest = torch.where(lost, 0.0, reach).amax(-1, keepdim=True)
     reach = torch.where(lost & (farthest > 0), _BEYOND * farthest, reach)
-    after = torch.searchsorted(angle, torch.atan2(y, x)) % SECTORS
-    before = (after - 1) % SECTORS
-    limit = torch.maximum(torch.gather(reach, -1, before), torch.gather(reach, -1, after))
-    return torch.hypot(x, y) / limit
+    place = torch.atan2(y, x)
+    after = torch.searchsorted(angle, place) % SECTORS
+    (low, high), (first, last) = (
+        (torch.gather(each, -1, (after - 1) % SECTORS), torch.gather(each, -1, after)) for each in (angle, reach)
+    )
+    # Around a cusp, or where angles jump, the farther one.
+    between = first + (last - first) * ((place - low) / (high - low)).clamp(0.0, 1.0)
+    steep = ((last - first).abs() > _STEEP * first) | ~(high > low)
+    return torch.hypot(x, y) / torch.where(steep, torch.maximum(first, last), between)
 
 
 def _follow_line(target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:

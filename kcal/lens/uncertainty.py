@@ -143,10 +143,13 @@ def projection_sigma(camera: Camera, places: Tensor, *, at: float = math.inf) ->
         >>> [round(float(value), 2) for value in projection_sigma(camera, torch.tensor([[0.0, 239.5], [319.5, 239.5]]))]
         [0.4, 0.0]
     """
-    found = pixel_covariance(camera, places, at=at)
-    good = found.isfinite().all(-1).all(-1)
-    largest = torch.linalg.eigvalsh(torch.where(good[..., None, None], found, 0.0))[..., -1]
-    return torch.where(good, largest.clamp_min(0.0).sqrt(), torch.nan)
+    return largest_sigma(pixel_covariance(camera, places, at=at))
+
+
+def largest_sigma(covariance: Tensor) -> Tensor:
+    """(...) standard deviation in the direction in which it is largest, of covariances (..., 2, 2); NaN of NaN."""
+    a, b, _, d = covariance.flatten(-2).unbind(-1)
+    return (0.5 * (a + d) + torch.hypot(0.5 * (a - d), b)).sqrt()
 
 
 def image_sigma(camera: Camera, columns: int = 33, rows: int = 25) -> Tensor:

@@ -18,6 +18,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibratio
 from kcal.calibrate.camera.trust import Examination, HalvesDifference, examine, residual_structure
 from kcal.finding import Finding
 from kcal.lens import rotation_from_vector
+from kcal.lens.difference import camera_difference
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.judge_camera import camera_verdict, stored_verdict, view_findings
 from kcal.report.judge_rig import rig_verdict, synchrony
@@ -83,6 +84,23 @@ def test_a_clean_capture_is_allowed_and_has_no_fault(clean: CameraCalibrationRes
         assert half.own < half.held_out < 1.3 * half.own
 
 
+@pytest.mark.slow
+def test_halves_begin_at_the_camera_of_all_views(poses: tuple[Tensor, Tensor]) -> None:
+    """With its amplitudes, and end where a fit of their own does."""
+    seen = observed(seen_by(camera("opencv5"), BOARD.points, *poses))
+    whole, some = calibrate_camera(seen), seen.subset(seen.names[::2])
+    half, alone = (trust._half(some, CalibrationOptions(), each) for each in (whole, None))
+    assert half.hybrid is not None
+    assert whole.hybrid is not None
+    assert torch.equal(half.hybrid.expected, whole.hybrid.expected)
+    assert half.iterations - whole.iterations < alone.iterations
+    assert half.rms == pytest.approx(alone.rms, rel=0.03)
+    apart, other = camera_difference(half.camera, alone.camera), camera_difference(half.camera, whole.camera)
+    assert apart.ratio is not None
+    assert apart.ratio < 0.5
+    assert other.rms > 1e-3
+
+
 def test_halves_that_do_not_predict_each_other_are_doubted(
     clean: CameraCalibrationResult, examination: Examination
 ) -> None:
@@ -103,7 +121,9 @@ def test_halves_that_predict_badly_are_set_beside_a_plain_lens(
     assert (found.model, found.own) == ("opencv5", 0.3)
     assert found.held_out == pytest.approx(math.sqrt(2) * NOISE, rel=0.2)
 
-    def compared(_: object, __: object, options: CalibrationOptions, label: str, alike: bool) -> HalvesDifference:
+    def compared(
+        _: object, __: object, options: CalibrationOptions, label: str, alike: bool, *___: object
+    ) -> HalvesDifference:
         asked.append(str(options.model))
         given = dataclasses.replace(examination.halves[0], label=label, alike=alike, own=0.1, still=0.2)
         return dataclasses.replace(given, held_out=ratio * 0.1)

@@ -61,20 +61,22 @@ _UNKNOWNS = 4
 
 
 def calibrate_hybrid(
-    observations: Observations, options: CalibrationOptions, progress: Progress
+    observations: Observations,
+    options: CalibrationOptions,
+    progress: Progress,
+    start: HybridFit | FitStart | None = None,
 ) -> CameraCalibrationResult:
-    """As `kcal.calibrate.camera.calibrate.calibrate_camera`, for the hybrid lens."""
+    """As `kcal.calibrate.camera.calibrate.calibrate_camera`, for the hybrid lens; from an earlier fit on if given."""
     board, pixels, names = observations.board.points, observations.pixels(), observations.names
     check_views(board, pixels, names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
     if options.reject is not None:
         return _hybrid_without_outliers(observations, options, options.reject, progress)
-    weights, start = torch.ones_like(pixels[..., 0]), None
+    weights, begun = torch.ones_like(pixels[..., 0]), start
     if options.weighted and observations.covariances() is not None:
-        start = rough_start(
-            board, pixels, observations.image_size, weights, options.of_fit(observations.image_size), progress
-        )
-        weights = corner_weights(observations, start.residuals)
-    fit = fit_by_options(observations, pixels, weights, start, options, progress)
+        size = observations.image_size
+        begun = begun or rough_start(board, pixels, size, weights, options.of_fit(size), progress)
+        weights = corner_weights(observations, begun.residuals)
+    fit = fit_by_options(observations, pixels, weights, begun, options, progress)
     return hybrid_result(observations, fit, options)
 
 

@@ -242,9 +242,11 @@ class TwoCameras:
 
 
 def lenses_by_view(
-    result: CameraCalibrationResult, options: CalibrationOptions, progress: Progress
+    result: CameraCalibrationResult, options: CalibrationOptions, progress: Progress, theta: Tensor | None = None
 ) -> CameraCalibrationResult | dict[int, str]:
     """A result that allows for a lens that moves from view to view; or the few views of another camera, and why.
+
+    `theta` (V, 3) is roughly θ of each view, where it is known.
 
     Raises:
         InputError: the views are of two cameras; or the lens moves, and is a parametric one.
@@ -268,7 +270,7 @@ def lenses_by_view(
                 return result
             own = CalibrationOptions(board=options.board, motion=options.motion, bending=options.bending)
             fit = fit_by_options(seen, pixels, None, None, own, progress)
-        found = own_lenses(fit, seen, pixels, own, progress)
+        found = own_lenses(fit, seen, pixels, own, progress, theta)
         strays, wrong = stray_corners(fit.residuals), list[Finding]()
         if found is not None and bool(strays.any()):
             wrong = outlier_findings(seen.names, fit.residuals, strays)
@@ -306,7 +308,12 @@ def lenses_by_view(
 
 
 def own_lenses(
-    fit: HybridFit, seen: Observations, pixels: Tensor, options: CalibrationOptions, progress: Progress = lambda _: None
+    fit: HybridFit,
+    seen: Observations,
+    pixels: Tensor,
+    options: CalibrationOptions,
+    progress: Progress = lambda _: None,
+    theta: Tensor | None = None,
 ) -> OwnLenses | None:
     """Scale and principal point of each view; None if all views have the same, or where nothing tells.
 
@@ -316,6 +323,7 @@ def own_lenses(
         pixels: (V, N, 2), NaN where not seen.
         options: with which they were fitted.
         progress: called after each further fit.
+        theta: (V, 3) roughly what will be found, or None.
     """
     views = _of_fit(fit, pixels, torch.zeros_like(pixels[:, 0, :1]).expand(-1, _SIZE))
     if not bool(views.N.isfinite().all() and views.g.isfinite().all()):
@@ -333,8 +341,8 @@ def own_lenses(
         if about.fall(second) < _PROMISED * _Parted.of(about, second, fit.size).price:
             return None
     else:
-        for _ in range(_ROUNDS):
-            views = refits.with_own(found.mean[:, :_SIZE])
+        for turn in range(_ROUNDS):
+            views = refits.with_own(found.mean[:, :_SIZE] if turn or theta is None else theta)
             found = _likeliest(views, _LENS)
             if refits.rest:
                 break

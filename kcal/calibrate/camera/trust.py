@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import re
@@ -13,7 +14,8 @@ from torch import Tensor
 
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.hybrid import corner_weights
+from kcal.calibrate.camera.hybrid import calibrate_hybrid, corner_weights
+from kcal.calibrate.camera.one_camera import lenses_by_view
 from kcal.calibrate.camera.result import COPY, CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
 from kcal.calibrate.camera.solve import calibrate_parametric
 from kcal.calibrate.camera.warnings import board_distances, corner_pupil, distance_text
@@ -171,7 +173,7 @@ def examine(
     else:
         for label, alike, parts in _splits(used):
             try:
-                halves.append(_compare(seen, parts, options, label, alike))
+                halves.append(_compare(seen, parts, options, label, alike, result))
                 progress(label)
                 if options.hybrid and alike and halves[-1].held_out > PREDICTED * halves[-1].own:
                     plain = _plain_lens(result.camera, seen, parts, options, halves[-1].still)
@@ -238,16 +240,36 @@ def _splits(names: list[str]) -> list[tuple[str, bool, tuple[list[str], list[str
     return found
 
 
+def _half(
+    seen: Observations, options: CalibrationOptions, whole: CameraCalibrationResult | None
+) -> CameraCalibrationResult:
+    """A calibration of some views, from that of all on where one is given."""
+    if not options.hybrid:
+        # A parametric lens stands for OpenCV's, which nobody asks whether it is one camera's.
+        return calibrate_parametric(seen, options, lambda _: None)
+    if whole is not None and whole.hybrid is not None and options.reject is None:
+        # What views may have at all, and how much of it, those of the whole decided.
+        own = [whole.observations.names.index(name) for name in seen.names]
+        start, theta = whole.hybrid.only(own), whole.by_view
+        with contextlib.suppress(KcalError, ArithmeticError, torch.linalg.LinAlgError):
+            if theta is None:
+                return calibrate_hybrid(seen, options, lambda _: None, start.settled)
+            found = calibrate_hybrid(seen, options, lambda _: None, start)
+            moving = lenses_by_view(found, options, lambda _: None, theta[own])
+            if isinstance(moving, CameraCalibrationResult):
+                return moving
+    return calibrate_camera(seen, options)
+
+
 def _compare(
-    seen: Observations, parts: tuple[list[str], list[str]], options: CalibrationOptions, label: str, alike: bool
+    seen: Observations,
+    parts: tuple[list[str], list[str]],
+    options: CalibrationOptions,
+    label: str,
+    alike: bool,
+    whole: CameraCalibrationResult | None = None,
 ) -> HalvesDifference:
-    # A parametric lens stands for OpenCV's, which nobody asks whether it is one camera's.
-    results = [
-        calibrate_camera(seen.subset(part), options)
-        if options.hybrid
-        else calibrate_parametric(seen.subset(part), options, lambda _: None)
-        for part in parts
-    ]
+    results = [_half(seen.subset(part), options, whole) for part in parts]
     sums = torch.zeros(3, dtype=torch.float64)
     corners = 0
     for fitted, other in (results, results[::-1]):

@@ -182,6 +182,7 @@ class FitStart(NamedTuple):
         residuals: (V, N, 2) projected minus observed, pixels, weights left out; NaN where a corner did not count.
         iterations: trial steps of the solver.
         displaced: (N, 2) meters by which corners are off their places beside the board's modes; None: not yet.
+        settled: amplitudes stay as they are, which are those of error bars.
     """
 
     estimate: Estimate
@@ -190,6 +191,7 @@ class FitStart(NamedTuple):
     residuals: Tensor
     iterations: int
     displaced: Tensor | None = None
+    settled: bool = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -300,6 +302,9 @@ def settle(
             capture = dataclasses.replace(capture, board=shown.with_corners())
             estimate = estimate.with_board(capture.board)
             estimate.state.board[-start.displaced.numel() :] = start.displaced.T.flatten()
+        if start.settled:
+            data = capture.data(capture.problem(estimate), estimate)
+            return Rounds(capture, capture.readout, estimate, data, math.nan, start.iterations, True)
         return run(capture, estimate, start.iterations)
     undecided = square is None and lens is None
     # Whether pixels are square is known well enough before amplitudes have converged.
@@ -532,6 +537,13 @@ class HybridFit:
         return FitStart(estimate, self.readout, self.square, self.residuals, self.iterations, self.displaced)
 
     @property
+    def settled(self) -> FitStart:
+        """A start for a fit of fewer of its views with the same amplitudes."""
+        start = self.as_start
+        amplitudes = start.estimate.amplitudes._replace(h=self.expected)
+        return start._replace(estimate=start.estimate._replace(amplitudes=amplitudes), settled=True)
+
+    @property
     def covariance(self) -> Tensor:
         """(5 + P, 5 + P) of the camera's parameters in the order of `Camera.names`: fx and fy alike, skew held."""
         unknowns = hybrid_unknowns(self.model, self.square)
@@ -580,7 +592,8 @@ def fit_hybrid(
         rounds = train_network(rounds, options.training, progress)
     capture, likely = rounds.capture, rounds.estimate
     # Error bars are for amplitudes as they are to be expected (`kcal.calibrate.hybrid.evidence`).
-    estimate = likely if robust or options.likely else expected_estimate(rounds)
+    set_before = robust or options.likely or (begun is not None and begun.settled)
+    estimate = likely if set_before else expected_estimate(rounds)
     model, families, state, (h, _, log_ratio, _), tempering, relative = estimate
     variance = estimate.variance
     # Modes that the evidence holds so closely to zero that no pixel feels them are left out, error bars included.
