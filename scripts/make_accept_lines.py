@@ -10,7 +10,6 @@ here, with their arithmetic; they are the first. None of the numbers is computed
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 from collections.abc import Iterator
 from fractions import Fraction
@@ -18,6 +17,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+
+from scripts.shared.children import interpreter
 
 TABLE = Path(__file__).parents[1] / "tests" / "promises" / "accept.txt"
 HEAD = """\
@@ -170,7 +171,7 @@ def by_fractions() -> Iterator[str]:
 
 def main() -> None:
     kept = TABLE.read_text(encoding="utf-8").splitlines() if TABLE.exists() else []
-    python = os.environ.get("KCAL_MRCAL")
+    python = interpreter("mrcal")
     lines = [HEAD.rstrip()]
     for name, (model, (width, height), intrinsics, named) in CAMERAS.items():
         numbers = " ".join(f"{value!r}" for value in intrinsics)

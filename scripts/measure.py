@@ -27,6 +27,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from scripts.shared.children import ASKED, answer
 from scripts.shared.page import DOCS, read_section, write_section
 from scripts.shared.sections import SECTIONS, Kept, Section, seeds
 from scripts.shared.timing import children_seconds, show
@@ -35,6 +36,13 @@ ROOT = Path(__file__).parent
 # Packages whose versions change what is measured, and modules of others, which count where a section loaded them.
 _TOLD = ("torch", "numpy", "scipy", "opencv-contrib-python-headless", "kornia")
 _PEERS = ("stonesoup", "onnxruntime", "pycolmap", "gtsam", "aniposelib", "Pose2Sim", "av", "rasterio", "erfa")
+# The same of programs in interpreters of their own.
+_ASKED_FOR = {"peers": "pyceres|pycolmap", "ros": "image-geometry|camera-calibration-parsers", "opencv": "opencv-.*"}
+_VERSIONS = """
+import importlib.metadata, json, re, sys
+known = [(each.name, each.version) for each in importlib.metadata.distributions()]
+print(json.dumps({"versions": [" ".join(one) for one in sorted(known) if re.fullmatch(sys.argv[1], one[0])]}))
+"""
 
 
 def load(page: str) -> list[Section]:
@@ -123,6 +131,8 @@ def _made(each: Section, chosen: dict[str, Any], spent: str) -> str:
     packages = importlib.metadata.packages_distributions()
     others = [name for module in _PEERS if module in sys.modules for name in packages.get(module, ())]
     told += [f"{name} {importlib.metadata.version(name)}" for name in (*_TOLD, *others)]
+    for peer, python in ASKED.items():
+        told += answer(python, "-c", _VERSIONS, _ASKED_FOR.get(peer, peer)).get("versions", [peer])
     return f"<!-- {', '.join(told)} -->"
 
 
@@ -145,7 +155,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("page", nargs="?", help=f"{', '.join(known)}; all if none is given")
     told = f"{', '.join(names)}; all if none is given"
     parser.add_argument("sections", nargs="*", metavar="SECTION", type=known_section, help=told)
-    options = {name: default for each in own for name, default in each.options.items()} if page else {}
+    # Sections of a page may have options of one name and other kinds.
+    asked = [each for each in own if each.name in words] or own if page else []
+    options = {name: default for each in asked for name, default in each.options.items()}
     kept = "kept" in options
     for name, default in options.items():
         if name not in ("write", "kept"):

@@ -24,7 +24,7 @@ import numpy as np
 from kcal.corners.observations import Observations
 from kcal.errors import KcalError
 from scripts.bench import solver
-from scripts.shared.children import ALONE, answer, or_failure
+from scripts.shared.children import ALONE, answer, interpreter, or_failure
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import table
@@ -88,7 +88,7 @@ def spline(lens: str, seen: Observations, focal: float, timeout: float) -> dict[
 
 def compare(views: int, repeats: int, timeout: float) -> list[Any]:
     """A row of the table."""
-    others = ["kcal, weak prior", *(["Ceres"] if os.environ.get("KCAL_PEERS") else [])]
+    others = ["kcal, weak prior", *(["Ceres"] if interpreter("peers") else [])]
     runs: dict[str, list[dict[str, Any]]] = {}
     data = simulate(views)
     with tempfile.TemporaryDirectory() as folder:
@@ -98,7 +98,7 @@ def compare(views: int, repeats: int, timeout: float) -> list[Any]:
             runs.setdefault(DEFAULT, []).append(own(DEFAULT, views))
             for name in others:
                 runs.setdefault(name, []).append(solver.run(name, path, 14, timeout))
-            if os.environ.get("KCAL_MRCAL"):
+            if interpreter("mrcal"):
                 seen = observed(data["pixels"].tolist())
                 runs.setdefault(SPLINE, []).append(spline(SPLINE, seen, 1500.0, timeout))
     cells: list[Any] = [views]
@@ -119,15 +119,15 @@ def time_of_fits(
     views: tuple[int, ...] = (6, 15, 30, 60, 200, 800), repeats: int = 3, timeout: float = 120.0
 ) -> Iterator[str]:
     header = ["views", DEFAULT, "14 coefficients, weak prior"]
-    header += ["Ceres, 14 coefficients"] if os.environ.get("KCAL_PEERS") else []
-    header += [f"mrcal, {SPLINE}"] if os.environ.get("KCAL_MRCAL") else []
+    header += ["Ceres, 14 coefficients"] if interpreter("peers") else []
+    header += [f"mrcal, {SPLINE}"] if interpreter("mrcal") else []
     return table([*header, "peak memory of the default"], (compare(count, repeats, timeout) for count in views))
 
 
 @section("one-camera.md", "captures", captures=("ch1280",))
 def time_of_captures(captures: tuple[str, ...] = ("all",), timeout: float = 300.0) -> Iterator[str]:
     """Captures by strangers; in brackets the default camera's time over the other's."""
-    mrcal, rows = os.environ.get("KCAL_MRCAL"), list[list[Any]]()
+    mrcal, rows = interpreter("mrcal"), list[list[Any]]()
     ratios, sums = dict[str, list[float]](), [0.0, 0.0]
     for name in names() if captures == ("all",) else captures:
         seen = load(name).seen

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -24,6 +23,7 @@ from torch import Tensor
 from kcal import Camera, Observations, Rig, RigOptions, calibrate_rig
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.hybrid.fit import fit_hybrid
+from scripts.shared.children import interpreter
 from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import merged
 from scripts.shared.real_captures import stereo_images
@@ -137,7 +137,7 @@ def cases(few: int) -> Iterator[tuple[str, Callable[[str], str], bool]]:
 @section("one-camera.md", "held-out", models=("opencv5",), only="left, each view")
 def held_out_views(models: tuple[str, ...] = tuple(MODELS), views: int = 8, only: str = "") -> Iterator[str]:
     """With so many views of the wide lens fitted in one of its rows; only rows whose name contains this."""
-    peers = [name for name, (peer, _) in PEERS.items() if f"KCAL_{peer.upper()}" in os.environ]
+    peers = [name for name, (peer, _) in PEERS.items() if interpreter(peer)]
     rows = (
         [
             what,

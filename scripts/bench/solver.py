@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from scripts.shared.children import answer
+from scripts.shared.children import answer, interpreter
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.page import table
 from scripts.shared.sections import section
@@ -170,7 +170,7 @@ SOLVERS = {
 }
 # The models that each of them has; 5 coefficients have no use for the weak prior.
 KNOWN = {"kcal": (5, 8, 14), "kcal, weak prior": (8, 14), "OpenCV": (5, 8, 14), "Ceres": (5, 8, 14), "mrcal": (5, 8)}
-PYTHON = {"Ceres": "KCAL_PEERS", "mrcal": "KCAL_MRCAL"}
+PYTHON = {"Ceres": "peers", "mrcal": "mrcal"}
 
 
 def work(name: str, path: str, coefficients: int) -> None:
@@ -216,14 +216,15 @@ def judge(data: dict[str, np.ndarray], solution: dict[str, np.ndarray], coeffici
 
 
 def run(name: str, path: Path, coefficients: int, timeout: float) -> dict[str, Any]:
-    python = os.environ.get(PYTHON.get(name, "KCAL_OPENCV" if name == "OpenCV" else ""), sys.executable)
+    peer = PYTHON.get(name, "opencv" if name == "OpenCV" else "")
+    python = (interpreter(peer) if peer else "") or sys.executable
     code = f"from scripts.bench.solver import work; work({name!r}, {str(path)!r}, {coefficients})"
     return answer(python, "-c", code, timeout=timeout)
 
 
 def compare(views: int, coefficients: int, repeats: int, timeout: float) -> Iterator[list[Any]]:
     """Rows of the table for one problem."""
-    able = [name for name in SOLVERS if name not in PYTHON or os.environ.get(PYTHON[name])]
+    able = [name for name in SOLVERS if name not in PYTHON or interpreter(PYTHON[name])]
     names = [name for name in able if coefficients in KNOWN[name]]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "views.npz"

@@ -30,6 +30,7 @@ from kcal.lens.rig import Mounting, Origin, Rig
 from kcal.locate import terrain
 from kcal.locate.siting import Site, area_of, rank_sites, siting_map
 from kcal.rig import planned_rig
+from scripts.shared.children import interpreter
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.page import DOCS, table
 from scripts.shared.sections import section
@@ -243,7 +244,7 @@ def together(cameras: int, views: int) -> Iterator[list[str]]:
         f"{peak_megabytes():.0f}",
         *_errors(rig, found.rotation, found.center),
     ]
-    if python := os.environ.get("KCAL_MRCAL"):
+    if python := interpreter("mrcal"):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "problem.npz")
             np.savez(

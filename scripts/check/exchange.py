@@ -1,8 +1,8 @@
 """Whether cameras survive the way to other programs and back: 10,000 points through each peer's own reader.
 
-The options name interpreters that have mrcal, ROS's camera_calibration_parsers and image_geometry, or pycolmap; without
-one its rows stay as they are on the page. OpenCV and SciPy are read in this process. Where no reader of a program can
-be installed here, its published formula projects what PyYAML or json reads.
+KCAL_MRCAL, KCAL_ROS and KCAL_PEERS name interpreters that have mrcal, ROS's camera_calibration_parsers and
+image_geometry, and pycolmap; without one its rows stay as they are on the page. OpenCV and SciPy are read in this
+process. Where no reader of a program can be installed here, its published formula projects what PyYAML or json reads.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from kcal.lens import LensModel, camera_difference, export_cameras, import_camer
 from kcal.lens.model import HybridForm, radius_over_angle
 from kcal.lens.zernike import ZernikeModes
 from scripts.check.foreign_lenses import by_formula
+from scripts.shared.children import interpreter
 from scripts.shared.page import merged, table
 from scripts.shared.sections import section
 
@@ -213,7 +214,7 @@ def fitted_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> l
     return rows
 
 
-def difference_rows(folder: Path, mrcal: str) -> list[list[str]]:
+def difference_rows(folder: Path) -> list[list[str]]:
     """`camera_difference` beside mrcal's on the same two files."""
     rows = []
     for scale in (0.1, 1.0, 10.0):
@@ -224,7 +225,7 @@ def difference_rows(folder: Path, mrcal: str) -> list[list[str]]:
             cameras.append(Camera(camera.params + i * change, size=camera.size, model=camera.model))
             export_cameras(cameras[-1], folder / f"{i}.cameramodel")
         names = f"{folder / '0.cameramodel'},{folder / '1.cameramodel'}"
-        ask(mrcal, "mrcal-diff", names, folder, folder / "diff.npz")
+        ask(interpreter("mrcal"), "mrcal-diff", names, folder, folder / "diff.npz")
         with np.load(folder / "diff.npz") as found:
             rows_columns = found["q"].shape[1], found["q"].shape[0]
             frames = camera_difference(*cameras, rotation=torch.eye(3), grid=rows_columns)
@@ -240,7 +241,7 @@ def difference_rows(folder: Path, mrcal: str) -> list[list[str]]:
 Reader = tuple[str, str, Project]
 
 
-def readers_of(mrcal: str, ros: str, colmap: str) -> dict[str, Reader]:
+def readers_of() -> dict[str, Reader]:
     """File, name and projection of each program that is here."""
     formula = "json, cv2.projectPoints"
     readers: dict[str, Reader] = {
@@ -252,35 +253,35 @@ def readers_of(mrcal: str, ros: str, colmap: str) -> dict[str, Reader]:
         "basalt": ("basalt.json", formula, by_basalt),
         "multical": ("multical.json", formula, by_multical),
     }
-    if ros:
+    if ros := interpreter("ros"):
         readers["ros"] = ("ros.yaml", "camera_calibration_parsers, cv2.projectPoints", peer(ros, "ros"))
-    if mrcal:
+    if mrcal := interpreter("mrcal"):
         readers["mrcal"] = ("camera.cameramodel", "mrcal.cameramodel, mrcal.project", peer(mrcal, "mrcal"))
-    if colmap:
+    if colmap := interpreter("peers"):
         readers["colmap"] = ("cameras.txt", "pycolmap", peer(colmap, "colmap"))
     return readers
 
 
 @section("other-programs.md", "formats")
-def formats(mrcal: str = "", ros: str = "", colmap: str = "") -> Iterator[str]:
+def formats() -> Iterator[str]:
     heads = ["format", "models", "reader and projection", "peer, px", "back in kcal, px"]
     with tempfile.TemporaryDirectory() as name:
-        rows = exact_rows(readers_of(mrcal, ros, colmap), Path(name))
+        rows = exact_rows(readers_of(), Path(name))
     return merged("other-programs.md", "formats", heads, rows)
 
 
 @section("other-programs.md", "refitted")
-def refitted(mrcal: str = "", ros: str = "", colmap: str = "") -> Iterator[str]:
+def refitted() -> Iterator[str]:
     heads = ["lens", "format", "fitted", "RMS, px", "stated maximum, px", "of 10,000 points; within"]
     with tempfile.TemporaryDirectory() as name:
-        rows = fitted_rows(readers_of(mrcal, ros, colmap), Path(name))
+        rows = fitted_rows(readers_of(), Path(name))
     return merged("other-programs.md", "refitted", heads, rows, keys=2)
 
 
 @section("other-programs.md", "difference")
-def difference(mrcal: str = "") -> Iterator[str]:
-    if not mrcal:
-        raise SystemExit("--mrcal names an interpreter that has mrcal")
+def difference() -> Iterator[str]:
+    if not interpreter("mrcal"):
+        raise SystemExit("KCAL_MRCAL names an interpreter that has mrcal")
     heads = ["kcal, RMS px", "mrcal, RMS px", "equal frames, px", "mrcal's turn, px", "own turns, px"]
     with tempfile.TemporaryDirectory() as name:
-        return table(heads, difference_rows(Path(name), mrcal))
+        return table(heads, difference_rows(Path(name)))

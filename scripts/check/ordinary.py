@@ -13,7 +13,6 @@ state, p is the chance of more. A model that was not measured has no column.
 from __future__ import annotations
 
 import math
-import os
 import statistics
 import subprocess
 import time
@@ -26,6 +25,7 @@ from kcal import Camera, KcalError
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.lens import camera_difference
 from kcal.report import camera_verdict
+from scripts.shared.children import interpreter
 from scripts.shared.held_out import Projection, held_out
 from scripts.shared.mrcal_camera import splined_camera
 from scripts.shared.page import table
@@ -48,7 +48,7 @@ def judged(name: str) -> Record:
         "opencv8": lambda half: opencv(half.seen, 8, criteria=END),
         "fisheye": lambda half: fisheye(half.seen),
     }
-    if "KCAL_MRCAL" in os.environ:
+    if interpreter("mrcal"):
         fitters["mrcal"] = lambda half: splined_camera(half.seen, half.weight)
     if kcal is not None:
         record["held"]["kcal"] = _held_out(kcal, halves)

@@ -1,10 +1,10 @@
 """What goes to other programs and comes from them: lens, error bars, pupil, board, and the largest error in the image.
 
-A FOLDER on PYTHONPATH may have aniposelib, pycolmap, pyceres and gtsam (`pip install --target FOLDER --no-deps ...`);
-what is not there is left out and named. "out": 10,000 points all over the image through the other program's own reader,
-against kcal's pixels. "in": a file that the other program wrote, or one in its published format, read by kcal, against
-the other program's projection. σ is the largest error of a standard deviation, relative, after the way through the
-file.
+A FOLDER on PYTHONPATH may have aniposelib, pycolmap, pyceres and gtsam (`pip install --target FOLDER --no-deps ...`),
+and KCAL_MRCAL names an interpreter that has mrcal; what is not there is left out and named. "out": 10,000 points all
+over the image through the other program's own reader, against kcal's pixels. "in": a file that the other program wrote,
+or one in its published format, read by kcal, against the other program's projection. σ is the largest error of a
+standard deviation, relative, after the way through the file.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from scripts.check.exchange import (
     readers_of,
     sample_camera,
 )
+from scripts.shared.children import interpreter
 from scripts.shared.page import table
 from scripts.shared.sections import section
 
@@ -130,8 +131,8 @@ def by_aniposelib(path: Path, points: np.ndarray) -> np.ndarray:
     return np.asarray(CameraGroup.load(str(path)).cameras[0].project(points)).reshape(-1, 2)
 
 
-def out_rows(folder: Path, mrcal: str | None) -> Iterator[Row]:
-    readers = readers_of(mrcal or "", "", "") | {
+def out_rows(folder: Path) -> Iterator[Row]:
+    readers = readers_of() | {
         "colmap": ("cameras.txt", "pycolmap", by_pycolmap),
         "gtsam": ("g.json", "gtsam", by_gtsam),
         "ceres": ("ceres.json", "json, cv2.projectPoints", by_ceres),
@@ -165,7 +166,7 @@ def opencv_file(path: Path, **more: Any) -> Path:
     return path
 
 
-def in_files(folder: Path, mrcal: str | None) -> Iterator[Given]:
+def in_files(folder: Path) -> Iterator[Given]:
     """Files of other programs, or in their formats."""
     zero = np.zeros(3)
     deviations = np.append(SIGMA, np.zeros(18 - len(SIGMA)))
@@ -243,7 +244,7 @@ def in_files(folder: Path, mrcal: str | None) -> Iterator[Given]:
         yield "colmap", "OPENCV", folder / "cameras.txt", None, "pycolmap", lambda p: _half_less(colmap.img_from_cam(p))
     except ImportError as missing:
         print(f"colmap: left out, {missing}", flush=True)
-    if mrcal:
+    if mrcal := interpreter("mrcal"):
         solved, deviations_path = folder / "b.cameramodel", folder / "sigma.npy"
         ask(mrcal, "mrcal-solve", str(solved), folder, deviations_path)
         project = peer(mrcal, "mrcal")
@@ -282,8 +283,8 @@ def agisoft(folder: Path) -> tuple[Path, np.ndarray, str, Callable[[np.ndarray],
     return path, np.array([sigma[name] for name in order]), "its XML, the manual's formula", project
 
 
-def in_rows(folder: Path, mrcal: str | None) -> Iterator[Row]:
-    for program, lens, path, sigma, reader, project in in_files(folder, mrcal):
+def in_rows(folder: Path) -> Iterator[Row]:
+    for program, lens, path, sigma, reader, project in in_files(folder):
         camera = import_cameras(path, size=SIZE if path.name == "results-cam.txt" else None).cameras[0]
         points, _ = random_points(camera)
         there = project(points)
@@ -293,6 +294,6 @@ def in_rows(folder: Path, mrcal: str | None) -> Iterator[Row]:
 
 
 @section("other-programs.md", "round trips")
-def round_trips(mrcal: str = "") -> Iterator[str]:
+def round_trips() -> Iterator[str]:
     with tempfile.TemporaryDirectory() as name:
-        return table(HEADS, [*out_rows(Path(name), mrcal or None), *in_rows(Path(name), mrcal or None)])
+        return table(HEADS, [*out_rows(Path(name)), *in_rows(Path(name))])

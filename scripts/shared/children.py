@@ -19,6 +19,15 @@ from typing import Any
 from unittest import mock
 
 ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+# Interpreters of other programs that were asked for; a page's comment tells what they have.
+ASKED: dict[str, str] = {}
+
+
+def interpreter(peer: str) -> str:
+    """The Python that has another program, for example mrcal: the variable KCAL_MRCAL; else nothing."""
+    if python := os.environ.get(f"KCAL_{peer.upper()}", ""):
+        ASKED[peer] = python
+    return python
 
 
 def answered(*command: object, timeout: float | None = None) -> dict[str, Any]:

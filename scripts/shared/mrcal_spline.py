@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from kcal.corners.board import Board
-from scripts.shared.children import answered
+from scripts.shared.children import answered, interpreter
 
 
 def splined(
@@ -58,5 +57,4 @@ def splined(
             square_m=board.square,
             focal=focal,
         )
-        interpreter = os.environ[f"KCAL_{peer.upper()}"]
-        return answered(interpreter, f"scripts/bench/peer_{peer}.py", path, lens, *field, timeout=timeout)
+        return answered(interpreter(peer), f"scripts/bench/peer_{peer}.py", path, lens, *field, timeout=timeout)
