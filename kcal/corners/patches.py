@@ -458,9 +458,12 @@ def _covariance(
     columns = torch.cat([flat, across], -1)
     weighted = robust[..., None] * columns
     spread = _blurred(weighted.mT.reshape(count, -1, height, width))
-    # What of the noise the fit takes away: of blurred noise, smooth columns take most.
-    gram = weighted.mT @ columns + 1e-9 * torch.eye(columns.shape[-1]).to(gram)
-    taken = torch.linalg.solve_ex(gram, spread @ spread.mT)[0].diagonal(dim1=-2, dim2=-1).sum(-1)
+    # What of the noise the fit takes away. Of smooth noise, only smooth columns take a whole unknown's; but weights that
+    # follow the noise of a small object take more, and a count of the unknowns leaves intervals that hold there.
+    taken: Tensor | float = columns.shape[-1]
+    if patches.grid is not None:
+        gram = weighted.mT @ columns + 1e-9 * torch.eye(columns.shape[-1]).to(gram)
+        taken = torch.linalg.solve_ex(gram, spread @ spread.mT)[0].diagonal(dim1=-2, dim2=-1).sum(-1)
     share_of_noise = float(_NOISE_BLUR.square().sum()) ** 2
     freedom = (1.0 - taken / (total * share_of_noise)).clamp_min(0.2)
     noise = (robust * residual.square()).sum(1) / total / (share_of_noise * freedom)

@@ -149,6 +149,27 @@ class TestShifts:
         # 60 repetitions know a variance to 18 %.
         assert bool(((ratio > 0.45) & (ratio < 1.7)).all())
 
+    @pytest.mark.parametrize("half", [4, 6])
+    def test_intervals_of_small_objects_hold(self, half: int) -> None:
+        """Of two images with noise: weights that follow it make residuals smaller than the noise is."""
+        image, generator = texture(3, 600), torch.Generator().manual_seed(6)
+        middle = 20.0 + 560.0 * torch.rand(300, 1, 1, 2, generator=generator, dtype=torch.float64)
+        places = middle + grid_of((half, half), image.device)
+        first, second = (
+            image_windows(
+                image + 12.0 * torch.randn(image.shape, generator=generator, dtype=torch.float64), places, 0, math.inf
+            )
+            for _ in range(2)
+        )
+        slopes = torch.eye(2, dtype=torch.float64).expand(*places.shape, 2)
+        template, wanted = sample(first, places), torch.ones(300, dtype=torch.bool)
+        found = fit_shifts(template, second, places, slopes, torch.ones_like(template), wanted)
+        ratio = (found.shift / found.covariance.diagonal(dim1=1, dim2=2).sqrt())[found.converged]
+        assert len(ratio) > 270
+        # 540 numbers know their RMS to 3 %.
+        assert 0.6 < float(ratio.square().mean().sqrt()) < 1.03
+        assert float((ratio.abs() < 1.96).double().mean()) > 0.94
+
     def test_objects_that_are_not_wanted_are_zero(self) -> None:
         template, image, places, slopes = (
             torch.cat([one, one]) if one.ndim > 2 else one for one in patches((0.7, -0.4))
