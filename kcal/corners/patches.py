@@ -458,8 +458,8 @@ def _covariance(
     columns = torch.cat([flat, across], -1)
     weighted = robust[..., None] * columns
     spread = _blurred(weighted.mT.reshape(count, -1, height, width))
-    # What of the noise the fit takes away. Of smooth noise, only smooth columns take a whole unknown's; but weights that
-    # follow the noise of a small object take more, and a count of the unknowns leaves intervals that hold there.
+    # What of the noise the fit takes away. Of smooth noise, only smooth columns take as much as an unknown does; but
+    # weights that follow the noise of a small object take more, and by a count of the unknowns its intervals hold.
     taken: Tensor | float = columns.shape[-1]
     if patches.grid is not None:
         gram = weighted.mT @ columns + 1e-9 * torch.eye(columns.shape[-1]).to(gram)
