@@ -157,7 +157,7 @@ def read(module: str) -> tuple[frozenset[str], frozenset[str]]:
     if not path.exists():  # a name in a module
         return frozenset(), frozenset()
     text = path.read_text(encoding="utf-8")
-    asked = set(re.findall(r"KCAL_(?:DATA|MRCAL|PEERS)", text))
+    asked = set(re.findall(r"KCAL_(?:DATA|MRCAL|PEERS|ROS|OPENCV|LENSBOY)", text))
     scripts = {f"{module.rpartition('.')[0]}.{name}" for name in re.findall(r'with_name\("(\w+)\.py"\)', text)}
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):

@@ -24,7 +24,7 @@ ASKED: dict[str, str] = {}
 
 
 def interpreter(peer: str) -> str:
-    """The Python that has another program, for example mrcal: the variable KCAL_MRCAL; else nothing."""
+    """The Python that has another program, by the variable KCAL_ and the program's name in capitals; else nothing."""
     if python := os.environ.get(f"KCAL_{peer.upper()}", ""):
         ASKED[peer] = python
     return python
