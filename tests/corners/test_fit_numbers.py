@@ -471,10 +471,10 @@ class TestShifts:
         kernel = np.exp(-0.5 * (np.arange(-4, 5) / sigma) ** 2)
         kernel /= kernel.sum()
         left = float((kernel**2).sum()) ** 2  # the variance that blur leaves of noise
-        # The fit takes the part of the noise that lies in the space of its columns.
+        # Of a sheared fit, the part of the noise that lies in the space of its columns; else a degree for each unknown.
         columns = np.concatenate([design, mixed], 1)
         blurred = spread_by(kernel) @ (w[:, None] * columns)
-        taken = np.trace(np.linalg.inv((columns.T * w) @ columns) @ blurred.T @ blurred)
+        taken = np.trace(np.linalg.inv((columns.T * w) @ columns) @ blurred.T @ blurred) if sheared else 4.0
         freedom = max(1.0 - taken / (w.sum() * left), 0.2)
         noise = (w * r**2).sum() / w.sum() / (left * freedom)
         force = w[:, None] * beyond(mixed)
