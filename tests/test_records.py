@@ -112,7 +112,7 @@ def test_tables_count_what_was_refused_and_said() -> None:
         {"key": ["hand", 8, 2, "default"], "refused": "too few"},
         {"key": ["stand", 8, 2, "default"], "refused": "too few"},
     ]
-    rows = [*captures_that_move.lines(records)][2:]
+    rows = [*captures_that_move.lines("none", records)][2:]
     assert rows[0] == "| 8 | hand | default | 3 | 33.3 % | 90.0 ± 5.0 | 2.000 | 2.236 | 1.000 |"
     assert "100.0 %" in rows[1]
     said = [

@@ -43,7 +43,7 @@ from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, sample_board_poses
 from scripts.shared.moving_captures import Hands, MovingCapture, draw_motion, moving_capture
-from scripts.shared.page import table
+from scripts.shared.page import merged, table
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import against_truth, bends, simulated, view_of
 from scripts.shared.timing import rms, share
@@ -182,8 +182,8 @@ def observed(pixels: Tensor, side: MovingCapture, inside: Tensor, kept: list[int
     return Observations(board=RIG_BOARD, image_size=CAMERA.size, views=views)
 
 
-def lines(records: list[Record], *terms: str) -> Iterator[str]:
-    """One row for each number of views, kind and fit, and how often these terms were found."""
+def lines(name: str, records: list[Record], *terms: str) -> Iterator[str]:
+    """One row for each number of views, kind and fit, and how often these terms were found; other rows stay."""
     cells: dict[tuple[int, str, str], list[Record]] = {}
     for record in records:
         kind, views, _, fit = record["key"]
@@ -207,7 +207,7 @@ def lines(records: list[Record], *terms: str) -> Iterator[str]:
         "views", "held by", "fit", "captures", "refused", "in 95 %, whole image", "median error, px",
         "RMS error", "RMS stated", *(f"{term} found" for term in terms),
     ]  # fmt: skip
-    return table(head, rows)
+    return merged("ordinary.md", name, head, rows, keys=3)
 
 
 def moving_lines(records: list[Record]) -> Iterator[str]:
@@ -275,7 +275,7 @@ def handheld(
     fits: tuple[str, ...] = ("default",),
 ) -> Iterator[str]:  # fmt: skip
     """`still`: without the terms for motion."""
-    return lines(captures_of(kept, seeds, views, ("hand", "stand"), fits))
+    return lines("handheld", captures_of(kept, seeds, views, ("hand", "stand"), fits))
 
 
 @section("ordinary.md", "bent", seeds=range(1))
@@ -284,7 +284,7 @@ def bent(
     fits: tuple[str, ...] = ("default",),
 ) -> Iterator[str]:  # fmt: skip
     """`stiff`: without the term for bending."""
-    return lines(captures_of(kept, seeds, views, ("bent", "few bent", "bent, hand"), fits), *TERMS)
+    return lines("bent", captures_of(kept, seeds, views, ("bent", "few bent", "bent, hand"), fits), *TERMS)
 
 
 @section("ordinary.md", "moving", seeds=range(1), kinds=("stand", "0.01 s apart, hand"))
