@@ -80,6 +80,7 @@ def make(each: Section, given: dict[str, Any], *, quick: bool, write: bool) -> N
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     print(f"{each.page}: {each.name}", flush=True)
+    ASKED.clear()
     start, children, write = time.process_time(), children_seconds(), write and not quick
     chosen = {name: value for name, value in given.items() if name in each.options and value is not None}
     more = {"write": write} if "write" in each.options else {}

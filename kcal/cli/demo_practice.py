@@ -123,8 +123,7 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
     check_folder(folder, seed)
     scene = practice.practice_scene(seed, views, scale)
     site = practice.PracticeSite(scene)
-    said = ""
-    parts = list(_practice_parts(site, frames, lambda: advance(said)))
+    parts = list(_practice_parts(site, frames))
     missing = [(path, work, write) for path, work, write in parts if not (folder / path).exists()]
     done = 0
     with steps("rendering", sum(work for _, work, _ in missing) or None) as advance:
@@ -133,7 +132,7 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
             said = f"{path}"
             advance(said, 0)
             try:
-                write(folder / path)
+                write(folder / path, functools.partial(advance, said))
             except ImportError as error:
                 extra = _EXTRAS.get(error.name or "", "video")
                 cure = f"pip install 'kcal[{extra}]', and run this again"
@@ -173,22 +172,20 @@ def read_truth_file(folder: Path) -> dict[str, Any]:
     return content
 
 
-_Write = Callable[[Path], object]
+_Write = Callable[[Path, Callable[[], None]], object]
 
 
-def _practice_parts(
-    site: practice.PracticeSite, frames: int, step: Callable[[], None]
-) -> Iterator[tuple[Path, int, _Write]]:
+def _practice_parts(site: practice.PracticeSite, frames: int) -> Iterator[tuple[Path, int, _Write]]:
     """Each file with the steps of its bar, and what writes it; the truth first, which says whose folder it is.
 
-    Of a film each frame is a step that it takes itself.
+    Of a film each frame is a step, which it tells itself.
     """
 
     def text(make: Callable[[], str]) -> _Write:
-        return lambda path: write_atomic(path, make())
+        return lambda path, _: write_atomic(path, make())
 
     def image(make: Callable[..., NDArray[np.uint8]], *given: Any) -> _Write:
-        return lambda path: rooms.write_png(path, make(*given))
+        return lambda path, _: rooms.write_png(path, make(*given))
 
     yield TRUTH, 1, text(lambda: dump_json(practice.practice_truth(site, frames)))
     yield Path("README.txt"), 1, text(lambda: readme_text(site.scene))
@@ -203,7 +200,7 @@ def _practice_parts(
     yield Path("site", "sketch.png"), 1, functools.partial(_sketch, site)
     yield Path("video", "detections.jsonl"), 1, text(lambda: _detections(site, frames))
     for side in practice.SIDES:
-        yield Path("video", f"{side}.mp4"), frames, functools.partial(_film, site, side, frames, step)
+        yield Path("video", f"{side}.mp4"), frames, functools.partial(_film, site, side, frames)
 
 
 def _board(scene: rooms.DemoScene, index: int, side: str, pose: Any) -> NDArray[np.uint8]:
@@ -218,7 +215,7 @@ def _night(site: practice.PracticeSite, side: practice.Side) -> NDArray[np.uint8
     return practice.night_picture(site, side, view.directions(catalog), catalog.magnitude)
 
 
-def _sketch(site: practice.PracticeSite, path: Path) -> None:
+def _sketch(site: practice.PracticeSite, path: Path, _: Callable[[], None]) -> None:
     scene = site.scene
     groups = [
         ([thing.name for thing in things], site.true_pixels("left", points.enu))
@@ -227,7 +224,7 @@ def _sketch(site: practice.PracticeSite, path: Path) -> None:
     rooms.save_site_sketch(path, site.picture("left", noise=0.0), *groups)
 
 
-def _film(site: practice.PracticeSite, side: practice.Side, count: int, step: Callable[[], None], path: Path) -> None:
+def _film(site: practice.PracticeSite, side: practice.Side, count: int, path: Path, step: Callable[[], None]) -> None:
     def told() -> Iterator[NDArray[np.uint8]]:
         for frame in practice.frames(site, side, count):
             yield frame

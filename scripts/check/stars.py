@@ -1,12 +1,12 @@
 """Stars: real images, identification of random points, and simulated rigs, as `docs/howto/stars.md` states them.
 
 Real images are those of `KCAL_DATA/stars` (six of one camera; esa/tetra3), compared with cedar-solve or tetra3 where
-one of them is installed. *rigs*: draws of noise, survey, tape (± 2 mm), clock (± 20 ms) and air (± 3 K), over 8 pairs
-of traced surveillance lenses (f 1600 px, level, 10 m apart), each calibrated by 30 views of a printed board; stars of
-0.1 px to magnitude 6 (1 pair) and 5 (20 pairs over 8 h), matches of unknown range of 0.1 px; targets in 9 bearings
-along the horizon. σ and errors are of the rig alone, with exact marks. *lens*: traced lenses with errors of assembly
-(webcam, machine vision, surveillance in turn), each calibrated by 20 views of a printed board (corners of 0.1 px), by
-20 night images over 8 h (stars to magnitude 5 of 0.1 px), and by both.
+one of them is installed; elsewhere its cells stay as the page has them. *rigs*: draws of noise, survey, tape (± 2 mm),
+clock (± 20 ms) and air (± 3 K), over 8 pairs of traced surveillance lenses (f 1600 px, level, 10 m apart), each
+calibrated by 30 views of a printed board; stars of 0.1 px to magnitude 6 (1 pair) and 5 (20 pairs over 8 h), matches of
+unknown range of 0.1 px; targets in 9 bearings along the horizon. σ and errors are of the rig alone, with exact marks.
+*lens*: traced lenses with errors of assembly (webcam, machine vision, surveillance in turn), each calibrated by 20
+views of a printed board (corners of 0.1 px), by 20 night images over 8 h (stars to magnitude 5 of 0.1 px), and by both.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from kcal.stars.detect import detect_stars, read_night, time_of
 from kcal.stars.lens import StarCamera, calibrate_by_stars
 from kcal.stars.night import SkyView, fit_attitude, name_stars
 from kcal.stars.sky import StarCatalog, identify
-from scripts.shared.page import table
+from scripts.shared.page import merged, table
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import NOT_KEPT, Kept, section
 from scripts.shared.star_lenses import lens_trials
@@ -60,12 +60,12 @@ def real(images: int = 6) -> Iterator[str]:
         found = name_stars(image, lens.camera, view)
         spent = time.process_time() - begin
         stars = found.attitude
-        told = theirs.get(path, ["not installed", "", ""])
+        told = theirs.get(path, [None, None, None])
         name = path.stem.split("_", 1)[-1]
         rows.append([name, len(found.detected.pixels), stars.count, f"{stars.rms_px:.3f}", f"{spent:.2f}", *told])
         said += [f"{path.stem}: {text}" for text in found.warnings]
     heads = ["image", "stars", "named", "RMS px", "detect and name, CPU s", "cedar-solve: stars", "its RMSE", "CPU s"]
-    yield from table(heads, rows)
+    yield from merged("stars.md", "real", heads, rows)
     yield from ["", *said, ""]
     yield from table(["magnitude", "stars", "RMS along an axis, px"], by_magnitude(whole))
     yield from ["", f"detection {np.mean(seconds):.2f} CPU s an image; lens and names {spent_on_lens:.0f}"]
