@@ -62,8 +62,8 @@ def write_video(
         stream.width, stream.height = images[0].shape[1], images[0].shape[0]
         stream.pix_fmt = pixel_format
         stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
-        # The same film on every machine: x264 compresses otherwise with another number of threads.
-        stream.codec_context.thread_count = 2
+        # The same film on every machine and in every run: with several threads x264 decides by who is first.
+        stream.codec_context.thread_count = 1
         for image, time in zip(images, times, strict=True):
             frame = av.VideoFrame.from_ndarray(image, format="gray")
             frame.pts, frame.time_base = round(1000 * time), Fraction(1, 1000)
