@@ -48,7 +48,8 @@ STATE = ROOT / ".mutants"
 TOP = "top"
 ROOMS = (
     "lens", "solve", "corners", "io", "calibrate/problem", "calibrate/hybrid", "calibrate/camera", "calibrate/rig",
-    "calibrate/batch", "nets", "locate", "stars", "scene", "report", "mark", "capture", "web", "pipeline", "cli", "sim",
+    "calibrate/batch", "nets", "locate", "stars", "scene", "skyline", "watch", "report", "mark", "capture", "web",
+    "pipeline", "cli", "sim",
     TOP,
 )  # fmt: skip
 # Loaded once, in the server of the processes.

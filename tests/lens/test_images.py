@@ -193,6 +193,36 @@ class TestModule:
             # Rounding, and float32 positions: 1e-4 px times differences of the whole range.
             assert (out.double() - exact).abs().max() < 0.5 + 1e-4 * top
 
+    @pytest.mark.parametrize("lead", [(), (2,), (2, 1), (0,)])
+    @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
+    def test_whole_numbers_are_sampled_as_floats_are(self, channels: int, lead: tuple[int, ...]) -> None:
+        undistort = Undistort(LITTLE, new_pinhole(LITTLE, 1))
+        assert not bool(undistort.mask.all())
+        for kind, top in ((torch.uint8, 255), (torch.uint16, 65535)):
+            image = (torch.rand(*lead, channels, 120, 160) * top).round().to(kind)
+            beside = image.movedim(-3, -1).contiguous().movedim(-1, -3)
+            exact, _ = undistort(image.double())
+            for same in (image, beside):
+                out, _ = undistort(same)
+                assert out.shape == exact.shape
+                assert bool(((out.double() - exact).abs() < 0.5 + 1e-4 * top).all())
+            if lead == (2, 1):
+                mapped = torch.func.vmap(lambda one: undistort(one)[0])(image)
+                assert (mapped.double() - exact).abs().max() < 0.5 + 1e-4 * top
+
+    def test_whole_numbers_of_several_cameras_and_of_one_that_changes(self) -> None:
+        image, batch = (
+            (torch.rand(3, 120, 160) * 255).to(torch.uint8),
+            Camera(torch.stack([LITTLE.params, OTHER.params]), size=(160, 120)),
+        )
+        out, _ = Undistort(batch)(image)
+        changed = Undistort(copy.deepcopy(LITTLE), new_pinhole(OTHER))
+        changed(image)
+        changed.load_state_dict(Undistort(OTHER).state_dict(), strict=False)
+        for got, camera in ((out[0], LITTLE), (out[1], OTHER), (changed(image)[0], OTHER)):
+            expected, _ = Undistort(camera)(image.double())
+            assert (got.double() - expected).abs().max() < 0.53
+
     def test_half_precision_keeps_positions(self) -> None:
         image = ramp((160, 120))[:1] / 160
         undistort = Undistort(LITTLE)
