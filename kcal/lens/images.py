@@ -268,17 +268,17 @@ def _sampled_by_opencv(image: Tensor, maps: Tensor, lead: tuple[int, ...]) -> Te
     from kcal.opencv import cv2
 
     images = image.expand(*lead, *image.shape[-3:])[None].flatten(0, -4)
-    maps = maps.expand(*lead, *maps.shape[-3:])[None].flatten(0, -4).numpy()
+    places = maps.expand(*lead, *maps.shape[-3:])[None].flatten(0, -4).numpy()
     count, channels, shape = len(images), image.shape[-3], maps.shape[-2:]
     together = channels in (3, 4)
     if together and images.movedim(1, -1).is_contiguous():
         out = images.new_empty((count, *shape, channels)).movedim(-1, 1)
-        for one, new, (columns, rows) in zip(images, out, maps, strict=True):
+        for one, new, (columns, rows) in zip(images, out, places, strict=True):
             pixels = one.movedim(0, -1).numpy(), new.movedim(0, -1).numpy()
             cv2.remap(pixels[0], columns, rows, cv2.INTER_LINEAR, pixels[1])
         return out.view(*lead, *out.shape[1:])
     out = images.new_empty((count, channels, *shape))
-    for one, new, (columns, rows) in zip(images.numpy(), out.numpy(), maps, strict=True):
+    for one, new, (columns, rows) in zip(images.numpy(), out.numpy(), places, strict=True):
         if together:
             cv2.split(cv2.remap(cv2.merge(list(one)), columns, rows, cv2.INTER_LINEAR), list(new))
         else:
