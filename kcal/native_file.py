@@ -75,6 +75,13 @@ class Record(pydantic.BaseModel):
         return {key: value for key, value in plain(self).items() if key not in later or value != later[key]}
 
 
+def without_unsaid(content: dict[str, Any] | None, name: str) -> dict[str, Any] | None:
+    """The block without this field where it says nothing, as for `Record._LATER`; changed in place."""
+    if content is not None and not content[name]:
+        del content[name]
+    return content
+
+
 def _underived(content: Any, places: Iterable[tuple[int | str, ...]]) -> Any:
     """The content without what is derived, in the blocks at these places."""
     rest: Any = copy.deepcopy(content)

@@ -156,6 +156,8 @@ def brief(record: Any, **said: str) -> str:
     """
     kind = type(record)
     if hasattr(record, "named_children"):
+        if any(part.is_meta for part in (*record.parameters(), *record.buffers())):
+            return f"{kind.__name__}(on the meta device)"
         children = (f"{name}={_brief_module(child)}" for name, child in record.named_children())
         return _in_lines(kind, [one for one in (record.extra_repr(), *children) if one])
     if dataclasses.is_dataclass(record):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import inspect
 import re
@@ -180,6 +181,8 @@ def test_every_other_public_class_is_told_in_three_lines() -> None:
     ]  # fmt: skip
     for value in made:
         check(value, type(value).__name__)
+    # Without numbers, as models are that get theirs later.
+    assert repr(copy.deepcopy(RIG).to("meta")) == "Rig(on the meta device)"
     told = {type(value) for value in made} | RECORDS
     others = {kind.__name__ for kind in PUBLIC.values() if inspect.isclass(kind) and kind not in told}
     errors = {name for name in others if issubclass(PUBLIC[name], BaseException)}

@@ -329,9 +329,6 @@ def _unseen(text: str) -> bool:
 
 # The noise of marks: one option of all commands, with the value that the rig's file states by default.
 
-# Of marks on sharp images, where nobody said.
-ASSUMED = 0.3
-
 
 def pixel_sigma_of(given: float | None, rig: kcal.Rig | None = None) -> float:
     """The noise of marks, px: as given, or as the rig's file states, or assumed; the last two are said."""
@@ -342,16 +339,5 @@ def pixel_sigma_of(given: float | None, rig: kcal.Rig | None = None) -> float:
 
 
 def pixel_sigma_and_source(given: float | None, rig: kcal.Rig | None = None) -> tuple[float, str]:
-    """The same, and what there is to say of it.
-
-    Raises:
-        InputError: not a positive number.
-    """
-    if given is not None:
-        if not 0 < given < 100:
-            raise InputError(f"--pixel-sigma {given}: a positive number of pixels is needed")
-        return given, ""
-    record = None if rig is None else rig.calibration
-    if record is not None and record.pixel_sigma is not None:
-        return record.pixel_sigma, f"noise of marks: {record.pixel_sigma:g} px, from the rig's file"
-    return ASSUMED, f"noise of marks: {ASSUMED:g} px, assumed; --pixel-sigma states it"
+    """The same, and what there is to say of it."""
+    return rooms.noise_of_marks(given, None if rig is None else rig.calibration, "--pixel-sigma")

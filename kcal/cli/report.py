@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import io
 import math
@@ -148,14 +147,7 @@ def calibrated_again(
     seen, options = kcal.Observations.load(observations), rooms.stored_options(camera)
     check_views_of([camera], [seen], [observations])
     with steps(what, None) as advance:
-        result = kcal.calibrate_camera(seen, options, advance)
-        if options.hybrid and rooms.other_views(camera, result)[0]:
-            # A file does not tell whether motion was left out.
-            still = dataclasses.replace(options, motion=False)
-            other = kcal.calibrate_camera(seen, still, advance)
-            if not rooms.other_views(camera, other)[0]:
-                return other, still
-        return result, options
+        return kcal.calibrate_camera(seen, options, advance), options
 
 
 def _of_rig(

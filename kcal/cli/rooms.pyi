@@ -63,6 +63,7 @@ from kcal.io.images import write_video as write_video
 from kcal.io.rig_file import RigFile as RigFile
 from kcal.io.rig_file import load_pair as load_pair
 from kcal.lens.calibration import CalibrationRecord as CalibrationRecord
+from kcal.lens.calibration import noise_of_marks as noise_of_marks
 from kcal.lens.camera_like import ray_error as ray_error
 from kcal.lens.difference import difference_text as difference_text
 from kcal.lens.uncertainty import paraxial_focal as paraxial_focal

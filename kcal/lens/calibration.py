@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from kcal.lens.information import CameraInformation
 
 
+# Pixels, of marks on sharp images, where nobody said.
+_MARK_SIGMA = 0.3
+
+
 def _refuse_negative(where: object, names: Iterable[str]) -> None:
     for name in names:
         value = getattr(where, name)
@@ -104,6 +108,7 @@ class CalibrationRecord:
             correlated; None if not estimated.
         observations: name of the observations file, if there was one.
         temperature: of the camera when the views were taken, °C; None if nobody said.
+        without: what a hybrid lens was told not to estimate of the views: "motion", "bending".
         warnings: what should be doubted of it, a sentence each.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
         created: when, with its time zone.
@@ -125,6 +130,7 @@ class CalibrationRecord:
     tempering: float | None = None
     board_deviation: tuple[tuple[float, float, float], ...] | None = None
     temperature: float | None = None
+    without: tuple[Literal["motion", "bending"], ...] = ()
     warnings: tuple[str, ...] = ()
     kcal_version: str
     created: datetime.datetime
@@ -302,6 +308,7 @@ class RigCalibration:
         undetermined: what the data leave open, camera by camera.
         warnings: what should be doubted of it, a sentence each, for example that its geometry is weak.
         pixel_sigma: noise of marks along each axis, pixels, as stated when the rig was solved; None if nobody did.
+        lens_change: by how much each lens may have changed since its calibration, as `RigOptions` states it, pixels.
         contradictions: which source contradicts the others beyond reasonable doubt, a sentence each.
         relocked: when only the cameras' attitudes were solved again, and from what.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
@@ -320,13 +327,14 @@ class RigCalibration:
     undetermined: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     pixel_sigma: float | None = None
+    lens_change: float = 0.0
     contradictions: tuple[str, ...] = ()
     relocked: str | None = None
     kcal_version: str
     created: datetime.datetime
 
     def __post_init__(self) -> None:
-        _refuse_negative(self, ("rms", "rms_px", "per_pair_rms"))
+        _refuse_negative(self, ("rms", "rms_px", "per_pair_rms", "lens_change"))
         _refuse_local_time(self.created)
         if self.pairs != len(self.per_pair_rms):
             raise InputError(f"pairs is {self.pairs}, but per_pair_rms has {len(self.per_pair_rms)}")
@@ -339,6 +347,29 @@ class RigCalibration:
 
 
 Attribute = TypeVar("Attribute")
+
+
+def noise_of_marks(given: float | None, record: RigCalibration | None, name: str = "pixel_sigma") -> tuple[float, str]:
+    """The noise of marks along each axis, px: as given, or as a rig's record states it, or assumed; and its source.
+
+    The source is empty where the noise was given; `name` is for messages.
+
+    Raises:
+        InputError: not a positive number.
+
+    Example:
+        >>> noise_of_marks(None, None)
+        (0.3, 'noise of marks: 0.3 px, assumed; --pixel-sigma states it')
+    """
+    sigma, source = given, ""
+    if sigma is None and record is not None and record.pixel_sigma is not None:
+        sigma, source = record.pixel_sigma, f"noise of marks: {record.pixel_sigma:g} px, from the rig's file"
+    elif sigma is None:
+        sigma, source = _MARK_SIGMA, f"noise of marks: {_MARK_SIGMA:g} px, assumed; --pixel-sigma states it"
+    if not 1e-6 <= sigma <= 1e6:
+        # Beyond, squares of it leave the range of float64, or the accuracy of the arithmetic.
+        raise InputError(f"{name}: a positive number of pixels, 1e-6 to 1e6, is needed, got {sigma}")
+    return float(sigma), source
 
 
 class UntilChanged(Generic[Attribute]):

@@ -18,7 +18,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.rig import Rig
 from kcal.locate.localizer import Localizer
-from kcal.locate.marks import PAIR, PIXELS, Marks, pixel_of, read_marks
+from kcal.locate.marks import COVARIANCE, PIXELS, Marks, read_marks
 from kcal.locate.max_likelihood import calibration_effect
 from kcal.locate.mounting import by_mounting
 from kcal.locate.stereo import BEARING_SIGMAS, QUANTILE, Localization, PositionStatus, checked_rig, sight_lines
@@ -647,7 +647,8 @@ def _contradiction(causes: Sequence[Cause], chance: float) -> Finding:
 def read_known_ranges(path: str | Path, marks: str | Path | None = None) -> KnownRanges:
     r"""Read known ranges: name,range,range_sigma in meters from the left camera, with marks in both images.
 
-    The four columns of marks stand in the same table, or in one of their own, in which the names are looked up.
+    The columns of marks, as of `read_marks`, stand in the same table, or in one of their own, in which the names are
+    looked up.
 
     Raises:
         FileError: see `read_marks`; a range without its sigma; a name that has no marks, or marks in both tables.
@@ -666,14 +667,12 @@ def read_known_ranges(path: str | Path, marks: str | Path | None = None) -> Know
         wanted = "marks stand in both tables; leave --marks out" if inside else "no columns of marks; give --marks"
         raise FileError(f"{path}: {wanted} ({_HEADER})")
     rows = read_rows(
-        path, _HEADER, ("name", *PIXELS, *_COLUMNS, "note"), (*(PIXELS if marks is None else ("name",)), *_COLUMNS)
-    )
+        path, _HEADER, ("name", *PIXELS, *COVARIANCE, *_COLUMNS, "note"),
+        (*(PIXELS if marks is None else ("name",)), *_COLUMNS),
+    )  # fmt: skip
     names = tuple(row.name for row in rows)
     known = torch.tensor([[_known_meters(row, column) for column in _COLUMNS] for row in rows], dtype=torch.float64)
-    if marks is None:
-        pixels = torch.tensor([[pixel_of(row, side, False) for side in PAIR] for row in rows], dtype=torch.float64)
-        return KnownRanges(Marks(names, pixels), *known.T)
-    found = read_marks(marks)
+    found = read_marks(path, more=_COLUMNS) if marks is None else read_marks(marks)
     place = {name: i for i, name in enumerate(found.names)}
     for row in rows:
         if row.name not in place:

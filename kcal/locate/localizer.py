@@ -16,6 +16,7 @@ from kcal.checks import StatedModule, as_points, as_tensor, expanded, scalar
 from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
+from kcal.lens.calibration import noise_of_marks
 from kcal.lens.pose import Movable, rotation_from_vector
 from kcal.lens.rig import Origin, Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, mean_radius, place_enu
@@ -30,7 +31,6 @@ from kcal.locate.stereo import (
     checked_pair_covariance,
     checked_pairs,
     checked_rig,
-    checked_sigma,
     checked_views,
     checked_views_covariance,
     flag_positions,
@@ -161,7 +161,8 @@ class Localizer(Operations, Movable, StatedModule):
             rig = copy.copy(rig)
             rig.root = root
         self.weights: Weights = weights or ("marks" if rig.is_pair else "all")
-        for name, value in (("pixel_sigma", checked_sigma(pixel_sigma, rig)), ("clock_sigma", clock_sigma)):
+        noise, _ = noise_of_marks(pixel_sigma, rig.calibration)
+        for name, value in (("pixel_sigma", noise), ("clock_sigma", clock_sigma)):
             self.register_buffer(name, scalar(value, rig.translation))
         self.lens: tuple[tuple[int, ...], ...] = ()
         if self.weights == "marks":

@@ -150,8 +150,13 @@ class PointLocator:
         reasons = [""] * count
         doubtful = found.reprojection.amax(-1).numpy() > _MISMATCH_SIGMAS * sigmas
         baseline = float(localize.rig.baseline)
+        apart = (found.status == int(PositionStatus.PARALLEL)) & found.range_low.isinf()
+        # Of rows of one mistake, most diverge, and all of these meet the other way round.
+        exchanged = 2 * int(apart.sum()) > count and bool(
+            (localize(right[apart], left[apart]).status == int(PositionStatus.OK)).all()
+        )
         for i in np.flatnonzero(~ok | doubtful).tolist():
-            reasons[i] = _pair_reason(PositionStatus(int(found.status[i])), found, i, baseline)
+            reasons[i] = _pair_reason(PositionStatus(int(found.status[i])), found, i, baseline, exchanged)
         return _as_columns(marks, found, reasons, numbers)
 
     def _of_views(self, marks: Marks) -> PositionColumns:
@@ -245,13 +250,16 @@ def camera_views(localize: Localizer) -> tuple[Viewpoint, ...]:
     )
 
 
-def _pair_reason(status: PositionStatus, found: Localization, i: int, baseline: float) -> str:
+def _pair_reason(status: PositionStatus, found: Localization, i: int, baseline: float, exchanged: bool) -> str:
     if status in _PAIR_TEXTS:
         return _PAIR_TEXTS[status]
     low = float(found.range_low[i])
     if status == PositionStatus.PARALLEL and math.isinf(low):
         angle = math.degrees(math.atan(-baseline * float(found.inverse_range[i])))
-        return f"the lines of sight diverge by {angle:.3g}°, more than noise: not the same point, or the rig has turned"
+        text = f"the lines of sight diverge by {angle:.3g}°, more than noise"
+        if exchanged:
+            return f"{text}, and meet with left and right exchanged, in all such rows: exchange columns or images"
+        return f"{text}: not the same point, or the rig has turned"
     if status == PositionStatus.PARALLEL and low == 0:
         return "a mark lies in the direction of the other camera: no range can be measured along that line"
     if status in (PositionStatus.PARALLEL, PositionStatus.BEARING_ONLY):

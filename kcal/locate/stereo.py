@@ -15,6 +15,7 @@ from torch import Tensor
 from kcal.checks import as_points, expanded, exportable
 from kcal.dispatch import CHUNK, is_traced
 from kcal.errors import DegenerateError, InputError
+from kcal.lens.calibration import noise_of_marks
 from kcal.lens.camera_like import unproject_each
 from kcal.lens.rig import Rig
 from kcal.locate.angular import EPIPOLE, triangulate_pairs
@@ -88,20 +89,9 @@ def flag_positions(code: Tensor, condition: Tensor, status: PositionStatus) -> T
     return torch.where(condition, code.new_full((), int(status)), code)
 
 
-def checked_sigma(pixel_sigma: float | None, rig: Rig) -> float:
-    """The sigma of the marks, positive: as given, or as the rig's calibration states, or 0.3 px."""
-    if pixel_sigma is None:
-        pixel_sigma = None if rig.calibration is None else rig.calibration.pixel_sigma
-        pixel_sigma = 0.3 if pixel_sigma is None else pixel_sigma
-    if not 1e-6 <= pixel_sigma <= 1e6:
-        # Beyond, squares of it leave the range of float64, or the accuracy of the arithmetic.
-        raise InputError(f"pixel_sigma: a positive number of pixels, 1e-6 to 1e6, is needed, got {pixel_sigma}")
-    return float(pixel_sigma)
-
-
 def checked_rig(rig: Rig, pixel_sigma: float | None) -> float:
-    """The same, after checking that the rig has a baseline."""
-    sigma = checked_sigma(pixel_sigma, rig)
+    """The noise of marks as `noise_of_marks` decides it, after checking that the rig has a baseline."""
+    sigma, _ = noise_of_marks(pixel_sigma, rig.calibration)
     if len(rig) < 2:
         raise InputError("a rig of two cameras or more is needed: one camera measures no range")
     apart = (rig.center - rig.center[0]).norm(dim=-1).amax()

@@ -389,19 +389,9 @@ class PairBoxes(StatedModule):
         Raises:
             InputError: shapes or dtypes that do not fit, boxes that are not finite or without area, or more than 2,000.
         """
-        # As a decorator it would load the compiler, 1.6 s, in every program that pairs boxes.
-        pair = torch.compiler.disable(self._pair) if torch.compiler.is_compiling() else self._pair
-        return pair(left, right, mask_left, mask_right, kinds, images)
-
-    def _pair(
-        self,
-        left: Tensor,
-        right: Tensor,
-        mask_left: Tensor | None,
-        mask_right: Tensor | None,
-        kinds: tuple[Tensor, Tensor] | None,
-        images: tuple[Tensor, Tensor] | None,
-    ) -> BoxPairs:
+        if torch.compiler.is_compiling():
+            # As a decorator it would load the compiler, 1.6 s, in every program that pairs boxes.
+            return torch.compiler.disable(self.forward)(left, right, mask_left, mask_right, kinds=kinds, images=images)
         sides = [
             _sound_boxes(f"{word} boxes", boxes, mask, camera.size)
             for word, boxes, mask, camera in (

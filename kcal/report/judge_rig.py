@@ -15,12 +15,12 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.checks import as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import FAULTS, Finding
+from kcal.lens.calibration import noise_of_marks
 from kcal.lens.camera import Camera
 from kcal.lens.pose import step_rows, vector_from_rotation
 from kcal.lens.projection import project_components
 from kcal.lens.rig import Rig
 from kcal.locate.budget import RangeSigmas, range_sigmas, station_sigmas
-from kcal.locate.stereo import checked_sigma
 from kcal.locate.views import fit_pairs
 from kcal.report.judge_camera import stored_findings
 from kcal.report.verdict import RangeAnswer, Requirement, Verdict, weighed_findings
@@ -178,7 +178,7 @@ def rig_verdict(
         >>> [answer.ok for answer in verdict.answers], verdict.reason
         ([True, False], 'at 5 km the range is known to ±6.8 %; 5 % are required; most of it is from relative pose')
     """
-    mark_sigma = checked_sigma(mark_sigma, rig)
+    mark_sigma, _ = noise_of_marks(mark_sigma, rig.calibration)
     findings = [*_inherited(rig, cameras), *_own_findings(rig, result)]
     if rig.is_pair:
         compared = _pairs_compared(rig, result, pairs)

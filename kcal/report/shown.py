@@ -79,6 +79,8 @@ def camera_blocks(content: Mapping[str, Any], known: CameraSummary) -> Blocks:
             f"{record['views']} views, {record['points']} corners, board {known.board}, "
             f"{len(record['excluded'])} left out"
         )
+        if record.get("without"):
+            yield f"without {' and '.join(record['without'])}"
         if record["temperature"] is not None:
             yield f"at {record['temperature']:g} °C"
     if stood := content.get("setting"):
@@ -122,6 +124,8 @@ def pose_blocks(content: Mapping[str, Any], known: RigSummary) -> Blocks:
         yield f"solved {_when(record)}: RMS {record['rms']:.4f} px, {record['pairs']} pairs"
         if record.get("pixel_sigma") is not None:
             yield f"noise of marks {record['pixel_sigma']:g} px along each axis"
+        if record.get("lens_change"):
+            yield f"lenses may have changed by {record['lens_change']:g} px at the image's corner"
         yield from (f"warning: {text}" for text in record["warnings"])
 
 
@@ -130,6 +134,8 @@ def stations_blocks(rig: Rig) -> Blocks:
     yield "error bars of cameras and poses together" if rig.root is not None else "no error bars of the poses"
     if (solved := rig.calibration) is not None:
         yield f"solved {solved.created:%Y-%m-%d %H:%M %Z}: RMS {solved.rms:.4f} px"
+        if solved.lens_change:
+            yield f"lenses may have changed by {solved.lens_change:g} px at the image's corner"
         yield from (f"open: {text}" for text in solved.undetermined)
         yield from (f"warning: {text}" for text in solved.warnings)
 

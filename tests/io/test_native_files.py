@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -100,6 +101,15 @@ class TestCamera:
         assert after.standard_deviations["skew"] is None
         assert after.standard_deviations["fy"] == 0.1 / 2
         assert tuple(after.standard_deviations) == camera.names
+
+    def test_what_was_left_out_is_kept_and_absent_elsewhere(self, tmp_path: Path, camera: Camera) -> None:
+        record = dataclasses.replace(camera_calibration(), without=("bending",))
+        save_camera(known(camera, record=record), tmp_path / "camera.json")
+        calibration = load_camera(tmp_path / "camera.json").calibration
+        assert calibration is not None
+        assert calibration.record == record
+        text = save_camera(known(camera, record=camera_calibration()), tmp_path / "camera.json").read_text()
+        assert "without" not in text
 
     def test_covariance_round_trip(self, tmp_path: Path, camera: Camera) -> None:
         """By name, without what was held, to the last bit; and as a rig's covariance wants it."""

@@ -39,6 +39,19 @@ def mixed() -> Located:
     return located_pairs(RIG, left, right, origin=ORIGIN, heading_deg=90.0, names=names, **STRAIGHT)
 
 
+def test_exchanged_columns_are_named() -> None:
+    right = tensor([975.5, 539.5], [960.0, 500.0], [1055.0, 530.0])
+    left = right - tensor([16.0, 0.0])
+    options = {"origin": ORIGIN, "heading_deg": 90.0, **STRAIGHT}
+    reasons = {row.reason.partition("°")[2] for row in located_pairs(RIG, left, right, **options).positions}
+    (reason,) = reasons
+    assert reason.endswith("meet with left and right exchanged, in all such rows: exchange columns or images")
+    # A single mismatch among good rows says nothing of the columns.
+    left[:2], right[:2] = right[:2].clone(), left[:2].clone()
+    (reason,) = (row.reason for row in located_pairs(RIG, left, right, **options).positions if row.reason)
+    assert "the rig has turned" in reason
+
+
 def test_end_to_end_with_real_lenses() -> None:
     rig, truth = real_rig(), spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64))
     left, right = rig(truth)[0].unbind(-2)

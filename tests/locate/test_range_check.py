@@ -16,6 +16,7 @@ from kcal import FileError, InputError, Rig
 from kcal.io.rig_file import save_rig
 from kcal.locate import Marks, check_ranges
 from kcal.locate.budget import RangeCheck, read_known_ranges
+from kcal.locate.marks import write_marks
 from kcal.rig import RigCovariance
 
 RANGES = tensor(180.0, 300.0, 420.0, 560.0, 700.0, 950.0)
@@ -149,6 +150,17 @@ def test_command(command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert "of a camera" in command.refuses("check good.json --ranges known.csv --distance 1km")
     (tmp_path / "ranges.csv").write_text("name,range,range_sigma\nmast,1.2km,5\n")
     assert "'1.2km'" in command.refuses("check good.json --ranges ranges.csv --marks marks.csv")
+
+
+def test_noise_of_each_mark_stands_in_the_same_table(tmp_path: Path) -> None:
+    write_marks(tmp_path / "marks.csv", seen()._replace(covariance=0.25 * torch.eye(4).double().repeat(6, 1, 1)))
+    head, *rows = (tmp_path / "marks.csv").read_text().splitlines()
+    lines = [f"{head},range,range_sigma", *(f"{row},{far},5" for row, far in zip(rows, RANGES.tolist(), strict=True))]
+    (tmp_path / "known.csv").write_text("\n".join(lines))
+    found = read_known_ranges(tmp_path / "known.csv")
+    assert found.marks.covariance is not None
+    assert found.marks.covariance[5, 3, 3] == 0.25
+    assert found.ranges.tolist() == RANGES.tolist()
 
 
 @pytest.mark.parametrize(

@@ -176,6 +176,7 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
         status=status,
         iterations=fit.iterations,
         hybrid=fit,
+        without=options.without,
         advice=what_to_photograph(observations, camera, fit.state.rotation),
         findings=(
             *general_findings([names[i] for i in used], camera, fit.rms, per_view[used], (), status, stated),

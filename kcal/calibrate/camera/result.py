@@ -171,6 +171,11 @@ class CalibrationOptions:
         return self.camera is None and (named or bool(LensModel.named(self.model).hybrid))
 
     @property
+    def without(self) -> tuple[Literal["motion", "bending"], ...]:
+        """What is left out, as `CalibrationRecord` says it."""
+        return (*(("motion",) if not self.motion else ()), *(("bending",) if not self.bending else ()))
+
+    @property
     def modes(self) -> FieldModes | None:
         """Of the field; None: those of the default lens."""
         if self.field is not None:
@@ -313,6 +318,7 @@ class CameraCalibrationResult(ArrowRows):
         rejected_views: views left out likewise, and copies of other views.
         by_view: (V, 3) logarithm of the scale, and principal point (pixels), of each view off those of the camera, if
             a stabilizer or an autofocus moves the lens; None: all views have the same.
+        without: what the options left out of a hybrid lens, as `CalibrationRecord` says it.
         shared_board: which cameras helped to measure the board, where several were calibrated together. Errors of such
             cameras are not quite independent of each other; a rig of them knows that.
     """
@@ -342,6 +348,7 @@ class CameraCalibrationResult(ArrowRows):
     rejected_corners: tuple[Rejected, ...] = ()
     rejected_views: tuple[Rejected, ...] = ()
     by_view: Tensor | None = None
+    without: tuple[Literal["motion", "bending"], ...] = ()
     shared_board: SharedBoard | None = None
 
     def __post_init__(self) -> None:
@@ -382,6 +389,7 @@ class CameraCalibrationResult(ArrowRows):
             noise=self.noise,
             tempering=None if self.hybrid is None else self.hybrid.tempering,
             board_deviation=None if moved is None else tuple((x, y, z) for x, y, z in moved),
+            without=self.without,
             warnings=self.warnings,
             **provenance(),
         )

@@ -217,7 +217,10 @@ def stored_options(camera: Camera) -> CalibrationOptions:
         return CalibrationOptions(model=camera.model, board_warp=warp, reject=reject)
     moved = record.board_deviation if record else None
     exact = moved is not None and not any(any(corner) for corner in moved)
-    return CalibrationOptions(board="exact" if exact else "printed", reject=reject)
+    left = record.without if record else ()
+    return CalibrationOptions(
+        board="exact" if exact else "printed", reject=reject, motion="motion" not in left, bending="bending" not in left
+    )
 
 
 def seen_pixels(result: CameraCalibrationResult) -> Tensor:

@@ -460,6 +460,7 @@ def rig_result(
     findings: list[Finding],
     *,
     refuse: bool,
+    lens_change: float,
 ) -> RigResult:
     """The result of a rig from its solution.
 
@@ -471,6 +472,7 @@ def rig_result(
         initial: from where it began.
         findings: that there are already.
         refuse: raise errors where measurements contradict each other or leave ranges open; otherwise doubts tell.
+        lens_change: as in `RigOptions`, for the record.
 
     Raises:
         InputError: a measured baseline or position that contradicts the rest, or several explanations.
@@ -541,7 +543,7 @@ def rig_result(
             "the data do not determine all parameters of the cameras: the rig has no covariance, and intervals know "
             "errors of the marks alone",
         )
-    findings += explanations.swap_findings(data, solution)
+    findings += explanations.swap_findings(data, solution) + explanations.survey_unit_findings(data, solution)
     cameras = data.cameras
     if any(bool(part.any()) for part in problem.unknowns.cameras):
         cameras = tuple(
@@ -568,7 +570,7 @@ def rig_result(
         findings=tuple(findings),
         _solution=solution,
         _places=places(work),
-        _provenance=provenance(),
+        _provenance={**provenance(), "lens_change": lens_change},
     )
 
 

@@ -21,7 +21,7 @@ from kcal.calibrate.rig.sources import RigData
 from kcal.errors import ContradictionError, DegenerateError, InputError
 from kcal.finding import Finding
 from kcal.solve.lm import LMOptions
-from kcal.texts import measured_length
+from kcal.texts import length_text, measured_length
 
 # Recognize cameras that were mixed up: the same one given twice, or left and right swapped throughout.
 #
@@ -35,6 +35,8 @@ _SIDEWAYS = 0.5
 _BEHIND_SIGMAS = 4.0
 # A single wrong match counts no more than an item that is three times worse than its sigmas.
 _MOST_BEHIND = 9.0
+# Meters: masts of a pair are 10 to 500 m apart, and landmarks that can be surveyed and marked stand before the horizon.
+_FAR_APART, _FAR_LANDMARKS = 1e3, 5e4
 # Fewer equal pixels may be equal by chance.
 _EQUAL_PIXELS = 4
 # χ² of three degrees of freedom that chance exceeds once in 1000 times.
@@ -119,6 +121,20 @@ def swap_findings(data: RigData, solution: RigSolution) -> list[Finding]:
         )
         found.append(Finding("swapped", "doubt", text))
     return found
+
+
+def survey_unit_findings(data: RigData, solution: RigSolution) -> list[Finding]:
+    """Ask for the survey's unit if cameras or landmarks are farther apart than is common, and no other length tells."""
+    if data.landmarks is None or data.boards is not None or data.baselines:
+        return []
+    centers = solution.state.center
+    apart = float(torch.cdist(centers, centers).max()) if {"left", "right"} == set(data.names) else 0.0
+    far = float(torch.cdist(data.landmarks.points, centers).median())
+    if apart <= _FAR_APART and far <= _FAR_LANDMARKS:
+        return []
+    cameras = f", and the cameras {length_text(apart)} apart" if apart else ""
+    text = f"landmarks are {length_text(far)} away (median){cameras}: is the survey in meters?"
+    return [Finding("units", "doubt", text, "convert the survey to meters, or measure the baseline too")]
 
 
 def cost_of_features_behind(problem: RigProblem, state: RigState) -> float:

@@ -312,7 +312,9 @@ def solve_rig(
         if change < 1e-3:
             break
     progress("uncertainty")
-    return rig_result(work, found, mask, reasons, initial, findings, refuse=options.reject)
+    return rig_result(
+        work, found, mask, reasons, initial, findings, refuse=options.reject, lens_change=options.lens_change
+    )
 
 
 def _first_mask(initial: InitialPoses, *, reject: bool) -> tuple[Tensor, Reasons]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from kcal import Camera, DegenerateError, InputError, Observations, load_camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.checks import OutlierRejection
-from kcal.calibrate.camera.trust import summarize
+from kcal.calibrate.camera.trust import stored_options, summarize
 from kcal.lens import rotation_from_vector
 from kcal.solve import LMOptions
 from scripts.shared.infinity import error_at_infinity
@@ -83,6 +83,9 @@ def test_exact_boards_stay_as_they_are() -> None:
     result = calibrate_camera(capture()[0], CalibrationOptions(board="exact", motion=False))
     assert torch.equal(result.board_points, BOARD.points)
     assert result.rms > calibrated().rms
+    again = stored_options(result.camera)
+    assert (again.board, again.motion, again.bending) == ("exact", False, True)
+    assert stored_options(calibrated().camera).motion
 
 
 def test_noise_free_corners() -> None:

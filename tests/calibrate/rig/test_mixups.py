@@ -10,7 +10,7 @@ import pytest
 import torch
 from rig_scenes import CAMERAS, CENTER, boards, features, landmarks, normal, see, spread_points, tensor
 
-from kcal import Baseline, Camera, Features, InputError, MeasuredPosition, RigData, solve_rig
+from kcal import Baseline, Camera, Features, InputError, MeasuredPosition, RigData, RigOptions, solve_rig
 
 BASELINE = Baseline(first=0, second=1, length=float((CENTER[0] - CENTER[1]).norm()), sigma=0.005)
 POSITIONS = tuple(MeasuredPosition(camera=c, point=CENTER[c], sigma=torch.full((3,), 0.02).double()) for c in (0, 1))
@@ -114,6 +114,18 @@ class TestSwap:
         (text,) = found.warnings
         assert text.startswith("8 of 8 features have negative parallax")
         assert "left and right marks are swapped" in text
+
+    def test_a_survey_in_millimeters_is_asked_for_its_unit(self) -> None:
+        survey = landmarks(noise=0.1, error=0.02)
+        large = dataclasses.replace(survey, points=1e3 * survey.points, sigma=1e3 * survey.sigma)
+        straight = RigOptions(refraction=0.0, refraction_sigma=0.0)
+        asked = [
+            [text for text in solve_rig(data, straight).warnings if "is the survey in meters?" in text]
+            for source in (survey, large)
+            for data in [RigData(cameras=CAMERAS[:2], names=("left", "right"), landmarks=source)]
+        ]
+        assert (asked[0], len(asked[1])) == ([], 1)
+        assert "the cameras 10.0 km apart" in asked[1][0]
 
     def test_a_rig_is_not_taken_for_its_mirror_image(self) -> None:
         """Features of unknown range fit a reversed baseline with negative ranges as well."""

@@ -37,6 +37,7 @@ from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import Context, PosedCamera, RigState, Start, as_items
 from kcal.calibrate.rig.unknowns import SharedUnknowns, held, joint_unknowns
 from kcal.errors import DegenerateError, InputError
+from kcal.io.rig_file import RigFile, rig_to_file
 from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
@@ -625,6 +626,10 @@ def test_a_lens_that_changed_since_its_calibration() -> None:
     for size in (0.0, 0.5):
         given = dataclasses.replace(data(**sources), cameras=changed)
         found = solve_rig(given, dataclasses.replace(STRAIGHT, lens_change=size, reject=False)).stereo()
+        content = rig_to_file(found).dump()
+        again = RigFile.parse(content, "rig.json").calibration
+        assert again is not None
+        assert (again.lens_change, "lens_change" in content["calibration"]) == (size, size > 0.0)
         off_by.append(abs(float(found.left.focal[0] / CAMERAS[0].focal[0]) - 1.0))
     assert off_by[0] == pytest.approx(5e-4)
     assert off_by[1] < 2e-4
