@@ -409,8 +409,8 @@ def _height_ahead(
     curve = frame.half_curvature * (1.0 - frame.refraction) * (1.0 - climb * climb)
     drop = own - target
     root = climb * climb - 4.0 * curve * drop
-    reached = torch.isfinite(height) & (drop > 0) & (climb < 0) & (root > 0)
-    far = torch.where(reached, 2.0 * drop / (torch.sqrt(torch.where(reached, root, 1.0)) - climb), 1.0)
+    reached = torch.isfinite(height) & (drop * climb < 0) & (root > 0)
+    far = torch.where(reached, 2.0 * drop.abs() / (torch.sqrt(torch.where(reached, root, 1.0)) + climb.abs()), 1.0)
     for _ in range(_HEIGHT_STEPS):
         bent = frame.refraction * frame.half_curvature * (1.0 - climb * climb) * far * far
         point = place + far[..., None] * ray - bent[..., None] * up

@@ -36,7 +36,9 @@ _PAIR_TEXTS = _TEXTS | {
     PositionStatus.BAD_COVARIANCE: "the covariance of the marks is not positive definite",
 }
 _VIEW_TEXTS = _TEXTS | {
-    PositionStatus.BEARING_ONLY: "only the bearing is known: one camera, or a parallax below three sigma",
+    PositionStatus.BEARING_ONLY: (
+        "only the bearing is known: one camera, a height out of its reach, or a parallax below three sigma"
+    ),
     PositionStatus.PARALLEL: f"the lines of sight do not meet before the cameras: {_ELSEWHERE}",
     PositionStatus.NOT_FINITE: "no camera has a mark",
     PositionStatus.CONTRADICTION: "the marks are not of one point, and which is wrong cannot be told",

@@ -37,7 +37,7 @@ def stations_of(rig: Rig) -> Rig:
 
 
 def station_stands(rig: Rig, camera: int) -> tuple[tuple[float, ...], tuple[float, ...], Tensor | None]:
-    """Place, then heading, pitch and roll (degrees), and their covariance, of a camera.
+    """Place, then heading, pitch and roll (degrees), and their covariance (6, 6) in meters and radians, of a camera.
 
     The place is latitude, longitude, height where the rig has an origin, otherwise meters of its frame, whose axes are
     taken as east, north and up.
@@ -45,10 +45,22 @@ def station_stands(rig: Rig, camera: int) -> tuple[tuple[float, ...], tuple[floa
     if rig.origin is not None:
         stands = station_mounting(rig, camera)
         place = (stands.origin.lat, stands.origin.lon, stands.origin.height)
-        return place, (stands.heading_deg, stands.pitch_deg, stands.roll_deg), stands.covariance
-    half = None if rig.root is None else rig.root[:, rig.pose_columns(camera)]
-    covariance = None if half is None else half.T @ half
-    return tuple(rig.center[camera].tolist()), attitude(rig.rotation[camera].T), covariance
+        angles, covariance = (stands.heading_deg, stands.pitch_deg, stands.roll_deg), stands.covariance
+    else:
+        half = None if rig.root is None else rig.root[:, rig.pose_columns(camera)]
+        covariance = None if half is None else half.T @ half
+        place, angles = tuple(rig.center[camera].tolist()), attitude(rig.rotation[camera].T)
+    if covariance is not None:
+        # Straight down, heading and roll are one turn.
+        by = torch.block_diag(torch.eye(3).double(), torch.linalg.pinv(_axes(*angles)))
+        covariance = by @ covariance[:6, :6] @ by.T
+    return place, angles, covariance
+
+
+def _axes(heading_deg: float, pitch_deg: float, roll_deg: float) -> Tensor:
+    """(3, 3) columns: the axes about which heading, pitch and roll turn a camera: down, to its right, and ahead."""
+    level, forward = enu_from_cam(heading_deg), enu_from_cam(heading_deg, pitch_deg, roll_deg)[:, 2]
+    return torch.stack([level[:, 1], level[:, 0], forward], 1)
 
 
 # Stations of which the pose is known beforehand: no landmarks are needed.
@@ -83,10 +95,7 @@ def stated_mounting(
     sigma = torch.tensor([*sigma_m, *(math.radians(one[1]) for one in (heading_deg, pitch_deg, roll_deg))])
     if not bool((sigma.isfinite() & (sigma >= 0)).all()):
         raise InputError("a station: sigmas must be finite and not negative")
-    level = enu_from_cam(heading_deg[0])
-    forward = enu_from_cam(heading_deg[0], pitch_deg[0], roll_deg[0])[:, 2]
-    # About these axes the angles turn the camera: up, to its right, and ahead.
-    axes = torch.stack([-level[:, 1], level[:, 0], forward], 1)
+    axes = _axes(heading_deg[0], pitch_deg[0], roll_deg[0])
     by = torch.block_diag(torch.eye(3).double(), axes) * sigma
     return Mounting(
         origin=origin, heading_deg=heading_deg[0], pitch_deg=pitch_deg[0], roll_deg=roll_deg[0], covariance=by @ by.T

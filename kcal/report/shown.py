@@ -173,15 +173,13 @@ def stands(rig: Rig) -> tuple[list[list[str]], dict[str, dict[str, float]]]:
         if rig.root is not None and covariance is not None:
             sigma = covariance.diagonal().sqrt().tolist()
             told[name] |= {"sigma_m": max(sigma[:3]), "sigma_deg": math.degrees(max(sigma[3:6]))}
-            level = math.degrees(max(sigma[3:5]))
             if not own:
                 where[2] = number_text(place[2], sigma[2])
             if not own and not rig.origin:
                 where[:2] = map(number_text, place[:2], sigma[:2])
             how = [
                 length_text(max(sigma[:2]), digits=2), length_text(sigma[2], digits=2),
-                measured_text(angles[0], math.degrees(sigma[5])), measured_text(angles[1], level),
-                number_text(angles[2], level),
+                *(measured_text(angle, math.degrees(error)) for angle, error in zip(angles, sigma[3:], strict=True)),
             ]  # fmt: skip
         rms = "" if residual is None else f"{residual:.3f}"
         rows.append([name, rms, *where, *([] if own else how)])

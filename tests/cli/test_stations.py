@@ -401,6 +401,8 @@ def test_known_poses_as_typed_and_in_a_table(known: Path, command: Command) -> N
     east = told["cameras"]["east"]
     assert (east["lat"], east["heading_deg"], east["pitch_deg"]) == pytest.approx((46.4, 200.0, 12.0), abs=1e-9)
     assert east["sigma_m"] == pytest.approx(10.0, rel=1e-3)
+    # As stated, though the axes of pitch and roll are neither east nor north.
+    assert told["tables"][0][1][-3:] == ["62.00 ± 0.10", "5.000 ± 0.050", "2.00 ± 0.20"]
     # One file at several places is one lens, named by the table; without --roll it is level, and that is said.
     command("place west.camera.json --places poses.csv -o one.json")
     assert load_rig("one.json").names == ("west", "east")

@@ -177,8 +177,13 @@ def test_one_camera_with_a_stated_height() -> None:
     error = result.enu - many
     squares = (error * torch.linalg.solve(result.covariance, error)).sum(-1)
     assert abs(float((squares < 7.815).double().mean()) - 0.95) < 0.02
-    upward = locate(marks(rig, points + torch.tensor([0.0, 0.0, 900.0])), seen, height=height)
-    assert (upward.status == int(PositionStatus.BEARING_ONLY)).all()
+    high = points + torch.tensor([0.0, 0.0, 900.0])
+    upward = marks(rig, high)
+    assert (locate(upward, seen, height=height).status == int(PositionStatus.BEARING_ONLY)).all()
+    # A summit, or an aircraft: the line of sight climbs to its height.
+    found = locate(upward, seen, height=enu_to_geodetic(high, ORIGIN)[:, 2], height_sigma=2.0)
+    assert (found.status == OK).all()
+    assert (found.enu - high).norm(dim=-1).max() < 0.02
 
 
 @pytest.mark.parametrize("count", [1, 3])
