@@ -122,7 +122,7 @@ def test_nothing_located_is_a_failure_with_its_reasons(folder: Path, command: Co
     [
         ("rig.json points.csv --site 151.2,-33.9,10 --heading 0", "longitude came first"),
         (f"{POINTS} --heading nan", "heading nan"),
-        (f"{POINTS} --heading 0 --pixel-sigma 0", "--pixel-sigma 0.0"),
+        (f"{POINTS} --heading 0 --pixel-sigma 0", "--pixel-sigma: a positive number"),
         (f"rig.json nothing.csv --site {ORIGIN} --heading 0", "nothing.csv: cannot read"),
         (
             f"points.csv points.csv --site {ORIGIN} --heading 0",
