@@ -105,7 +105,7 @@ def _foreign_kind(path: Path, head: bytes, size: int) -> str:
         return "marks"
     if columns & {"lat", "lon", "east", "north"}:
         return "survey"
-    if len(columns) > 1 and not text.startswith(("%", "<", "#", "{", "[")):
+    if (len(columns) > 1 or columns == {"name"}) and not text.startswith(("%", "<", "#", "{", "[")):
         return "table"
     return "foreign" if text.startswith(("%YAML", "<?xml", "#", "cam0", "{", "image_width")) else "unknown"
 
