@@ -388,6 +388,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
         ("a.csv", b"name\tlat\tlon\n", "survey"),
         ("a.csv", b"name, East, up\n", "survey"),
         ("a.csv", b"name,place\n1,2\n", "table"),
+        ("a.csv", "name\nHafen\n".encode("utf-8-sig"), "table"),
         ("a.csv", b"words without a comma\n1,2\n", "unknown"),
     ],
 )
