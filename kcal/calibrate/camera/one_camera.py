@@ -49,6 +49,8 @@ _LENS = ((-1, 0, 0, -1, -1, -1), (0, -1, -1, -1, -1, -1), (0, 1, 1, -1, -1, -1))
 _OTHER = 10
 # Share of the variances of motions with which the search for amplitudes begins: a lens that moves was taken for motion.
 _LESS = 0.01
+# Standard deviations of a score, from which amplitudes are asked for: of .. clean captures one in .. has more.
+_ASKED = 1.5
 # Share of its price that must be in sight before a camera is fitted again for two groups alone.
 _PROMISED = 0.4
 # Two values that gain a smaller share of what a spread of values does are not tried: where two cameras were true they
@@ -59,6 +61,8 @@ _APART, _APART_CENTER = 0.1, 0.02
 # Rounds of refits; share of θ, and standard deviations of the camera, by which the last one changes it; the largest
 # share of a step of groups that the next one is taken to be; and steps of the search for amplitudes.
 _ROUNDS, _REST, _MOVED, _AHEAD, _STEPS = 12, 0.05, 0.2, 0.6, 60
+# Share of variances by which the last step of that search changes them.
+_SETTLED = 1e-3
 # What to do about a lens that moves.
 _STILL = "lock focus and zoom, switch the image stabilizer off (also in the camera's app), and photograph again"
 # Fewer views tell nothing; one view alone may be wrong otherwise, and a scale and principal point suits it.
@@ -72,46 +76,84 @@ _CLEAR, _TOLD, _AGREE = 3.0, 3.0, 9.2
 
 
 class _ByView(NamedTuple):
-    """χ² of each view by x: its motion and bending over their deviations, θ, and how its board bends: 2 gᵀx + xᵀNx.
+    """χ² by x of each view: its motion and bending over their deviations, θ, and how its board bends: 2 gᵀx + xᵀNx.
+
+    And by the lens and board of all views, y, in combinations of unit weight: 2 (b + Σ Cᵀx)ᵀ y + yᵀy. They would hide
+    a good part of what moves, were they held where one camera for all views has them.
 
     Attributes:
         N: (V, X, X).
         g: (V, X).
+        C: (V, X, S).
+        b: (V, S), to be summed.
         ties: which numbers of the motion and bending share an amplitude.
         begin: (6,) standard deviations of the rest, larger than any, with which the search for amplitudes begins.
     """
 
     N: Tensor
     g: Tensor
+    C: Tensor
+    b: Tensor
     ties: tuple[int, ...]
     begin: Tensor
 
     def lens(self, held: float = 1.0) -> _ByView:
         """By θ alone, motions integrated out, with this share of their variances; the board as it is."""
         count = len(self.ties)
-        inner = self.N[:, :count, :count] + torch.eye(count, dtype=torch.float64) / held
-        rest = torch.cat([self.N[:, :count, count : count + _SIZE], self.g[:, :count, None]], 2)
-        gone = torch.linalg.solve(inner, rest)
-        across = self.N[:, count : count + _SIZE, :count]
-        N = self.N[:, count : count + _SIZE, count : count + _SIZE] - across @ gone[..., :-1]
-        g = self.g[:, count : count + _SIZE] - (across @ gone[..., -1:])[..., 0]
-        return _ByView(N, g, (), self.begin[:_SIZE])
+        own, inner = slice(count, count + _SIZE), self.N[:, :count, :count]
+        rest = torch.cat([self.N[:, :count, own], self.g[:, :count, None], self.C[:, :count]], 2)
+        gone = torch.linalg.solve(inner + torch.eye(count, dtype=torch.float64) / held, rest)
+        left = torch.cat([self.N[:, own, own], self.g[:, own, None], self.C[:, own]], 2) - rest[..., :_SIZE].mT @ gone
+        shared = rest[..., _SIZE + 1 :].mT @ gone[..., _SIZE:]
+        N, g, C = left[..., :_SIZE], left[..., _SIZE], left[..., _SIZE + 1 :]
+        H = torch.eye(C.shape[-1], dtype=torch.float64) - shared[..., 1:].sum(0)
+        return _ByView(N, g, *_unit_weight(H, C, self.b - shared[..., 0]), (), self.begin[:_SIZE])
 
-    def change(self, theta: Tensor) -> Tensor:
-        """(..., V) of χ² by θ (..., V, 3), or by one for all (..., 1, 3)."""
+    def score(self, own: list[int]) -> float:
+        """Standard deviations by which these numbers of θ, were they normal and small, vary more than noise."""
+        C, g = self.C[:, own].flatten(0, 1), self.g[:, own].flatten()
+        K, g = torch.block_diag(*self.N[:, own][..., own]) - C @ C.T, g - C @ self.b.sum(0)
+        return float((g @ g - K.trace()) / (math.sqrt(2.0) * K.norm()))
+
+    def change(self, theta: Tensor, y: Tensor) -> Tensor:
+        """(..., V) of χ² by θ (..., V, 3), or by one for all (..., 1, 3), with this lens and board (..., S)."""
         each = theta.expand(*theta.shape[:-2], *self.g.shape)
-        return (each * (2.0 * self.g + (self.N @ each[..., None])[..., 0])).sum(-1)
+        slope = self.g + (self.C @ y[..., None, :, None])[..., 0]
+        return (each * (2.0 * slope + (self.N @ each[..., None])[..., 0])).sum(-1)
 
-    def best(self, second: Tensor) -> Tensor:
-        """(..., 2, 3) the best θ of both groups; `second` (..., V) tells which views are in the second one."""
+    def others(self, theta: Tensor) -> Tensor:
+        """(..., S) the best lens and board with θ (..., V, 3)."""
+        return -self.b.sum(0) - (self.C.mT @ theta[..., None])[..., 0].sum(-2)
+
+    def total(self, theta: Tensor) -> Tensor:
+        """(...) the change of χ² by θ (..., V, 3), lens and board at their best."""
+        b = self.b.sum(0)
+        return self.change(theta, torch.zeros_like(b)).sum(-1) - self.others(theta).square().sum(-1) + b @ b
+
+    def best(self, second: Tensor) -> tuple[Tensor, Tensor]:
+        """(..., 2, 3) the best θ of both groups and its covariance (..., 6, 6); `second` (..., V): the second group."""
         groups = torch.stack([~second, second], -2).to(self.g.dtype)
-        N, g = (groups @ self.N.flatten(1)).unflatten(-1, self.N.shape[1:]), groups @ self.g
-        return -torch.linalg.lstsq(N, g[..., None]).solution[..., 0]
+        g, C = groups @ self.g, (groups @ self.C.flatten(1)).unflatten(-1, self.C.shape[1:]).flatten(-3, -2)
+        N = (groups @ self.N.flatten(1)).unflatten(-1, self.N.shape[1:])
+        apart = torch.eye(2, dtype=torch.float64)[:, None, :, None]
+        N = (apart * N[..., None, :]).flatten(-4, -3).flatten(-2) - C @ C.mT
+        slope, unit = g.flatten(-2)[..., None] - C @ self.b.sum(0)[:, None], self.begin[:_SIZE].repeat(2)
+        inverse = unit[:, None] * torch.linalg.pinv(unit[:, None] * N * unit, hermitian=True) * unit
+        return (inverse @ -slope).unflatten(-2, (2, _SIZE))[..., 0], inverse
 
     def fall(self, second: Tensor) -> Tensor:
         """(...) half of that by which χ² falls with the best of both groups: nats."""
-        theta = self.best(second)
-        return -0.5 * torch.where(second, self.change(theta[..., 1:, :]), self.change(theta[..., :1, :])).sum(-1)
+        return -0.5 * self.total(self.of_groups(self.best(second)[0], second))
+
+    def of_groups(self, both: Tensor, second: Tensor) -> Tensor:
+        """(..., V, 3) θ of each view, from those of both groups (..., 2, 3)."""
+        return torch.where(second[..., None], both[..., 1:, :], both[..., :1, :])
+
+    def by_group(self, second: Tensor) -> Tensor:
+        """(..., V) of χ² by being in the second group, less that by being in the first one."""
+        both = self.best(second)[0]
+        y = self.others(self.of_groups(both, second))
+        return self.change(both[..., 1:, :], y) - self.change(both[..., :1, :], y)
 
     def spread(self, tied: Sequence[int]) -> _Spread:
         """Normal motions and others, whose amplitudes have the largest evidence (by EM); `tied` tells which are one."""
@@ -122,6 +164,10 @@ class _ByView(NamedTuple):
             zeros = self.g.new_zeros(len(self.g), len(tied))
             return _Spread(0.0, zeros[:, 0], zeros[0], zeros)
         N, g, one = self.N[:, index[:, None], index], self.g[:, index], torch.eye(len(index), dtype=torch.float64)
+        # Other combinations of lens and board are felt by none of these numbers.
+        basis = torch.linalg.qr(self.C[:, index].flatten(0, 1).T)[0]
+        C, each_b = self.C[:, index] @ basis, self.b @ basis
+        b, free = each_b.sum(0), torch.eye(basis.shape[1], dtype=torch.float64)
         share = (ties[index] == ties[index, None]).double()
         share = share / share.sum(1)
         variance = share @ torch.cat([self.g.new_full((count,), _LESS), self.begin.square()])[index]
@@ -129,9 +175,17 @@ class _ByView(NamedTuple):
             root = variance.sqrt()
             inner = one + root[:, None] * N * root
             P = root[:, None] * torch.linalg.inv(inner) * root
-            mean = -(P @ g[..., None])[..., 0]
-            variance = share @ (P.diagonal(dim1=1, dim2=2) + mean.square()).mean(0)
-        nats = -0.5 * ((mean * g).sum(-1) + torch.linalg.slogdet(inner).logabsdet)
+            PC, flat = P @ C, C.flatten(0, 1)
+            M = torch.linalg.cholesky(free - flat.T @ PC.flatten(0, 1))
+            y = -torch.cholesky_solve((b - PC.flatten(0, 1).T @ g.flatten())[:, None], M)[:, 0]
+            mean = -(P @ g[..., None])[..., 0] - PC @ y
+            by_others = torch.linalg.solve_triangular(M, PC.flatten(0, 1).T, upper=False).square().sum(0)
+            before, spread = variance, P.diagonal(dim1=1, dim2=2) + by_others.view(mean.shape)
+            variance = share @ (spread + mean.square()).mean(0)
+            if bool(((variance - before).abs() <= _SETTLED * before).all()):
+                break
+        nats = -0.5 * ((mean * g).sum(-1) + each_b @ (y + b) + torch.linalg.slogdet(inner).logabsdet)
+        nats -= M.diagonal().log().sum() / len(nats)
         sigma, each = N.new_zeros(len(ties)), N.new_zeros(len(N), len(ties))
         sigma[index], each[:, index] = root, mean
         # A second amplitude must be worth it.
@@ -328,11 +382,14 @@ def own_lenses(
     views = _of_fit(fit, pixels, torch.zeros_like(pixels[:, 0, :1]).expand(-1, _SIZE))
     if not bool(views.N.isfinite().all() and views.g.isfinite().all()):
         return None
-    found, none, bent = _likeliest(views, _LENS), views.spread(_NONE), views.spread(_BENT)
-    if bent.beyond(none) >= 0.0 and bent.nats > found.nats:
-        return None
     refits, about, normal, nats = _Refits(fit, seen, pixels, options, progress), views.lens(), None, 0.0
-    if found.beyond(none) < 0.0:
+    spreads = max(about.score(own) for own in ([0], [1, 2])) > _ASKED
+    if spreads:
+        found, none, bent = _likeliest(views, _LENS), views.spread(_NONE), views.spread(_BENT)
+        if bent.beyond(none) >= 0.0 and bent.nats > found.nats:
+            return None
+        spreads = found.beyond(none) >= 0.0
+    if not spreads:
         # Two values may be likelier where no spread is: motions that are held back do not hide the groups.
         held = views.lens(_LESS)
         second = _grouped(held, held.spread(_LENS[-1]).mean, fit.size)
@@ -407,7 +464,7 @@ class _Refits:
         gained = _evidence_at(fit, tempering) - _evidence_at(first, tempering)
         # Pixels were moved, and scaled.
         counts = self.pixels[..., 0].isfinite().sum(1)
-        return gained + 0.5 * float(views.change(self.theta).sum()) - 2.0 * float((counts * self.theta[:, 0]).sum())
+        return gained + 0.5 * float(views.total(self.theta)) - 2.0 * float((counts * self.theta[:, 0]).sum())
 
 
 class _Parted(NamedTuple):
@@ -426,12 +483,14 @@ class _Parted(NamedTuple):
     @classmethod
     def of(cls, views: _ByView, second: Tensor, size: tuple[int, int]) -> _Parted:
         """Of groups of which `second` (V,) is one."""
-        covariance = torch.linalg.pinv(torch.stack([views.N[~second].sum(0), views.N[second].sum(0)])).sum(0)
+        both, of_both = views.best(second)
+        difference = torch.cat([-torch.eye(_SIZE, dtype=torch.float64), torch.eye(_SIZE, dtype=torch.float64)], 1)
+        covariance = difference @ of_both @ difference.T
         unit, share = _widths(size), float(second.double().mean())
         known = torch.eye(_SIZE, dtype=torch.float64) + torch.linalg.pinv(covariance) * unit * unit[:, None]
         mixed = -sum(part * math.log(part) for part in (share, 1.0 - share) if part > 0)
         price = 0.5 * float(torch.logdet(known)) + 0.5 * math.log(len(second)) + len(second) * mixed
-        return cls(views.best(second), covariance, price)
+        return cls(both, covariance, price)
 
 
 def _grouped(views: _ByView, mean: Tensor, size: tuple[int, int]) -> Tensor:
@@ -443,8 +502,7 @@ def _grouped(views: _ByView, mean: Tensor, size: tuple[int, int]) -> Tensor:
     low, high = lines.aminmax(dim=1, keepdim=True)
     second = torch.cat([lines > lines.median(1, keepdim=True).values, lines > 0.5 * (low + high)])
     for _ in range(_STEPS):
-        theta = views.best(second)
-        moved = views.change(theta[:, 1:]) < views.change(theta[:, :1])
+        moved = views.by_group(second) < 0.0
         if torch.equal(moved, second):
             break
         second = moved
@@ -459,9 +517,8 @@ def _two_cameras(refits: _Refits, views: _ByView, second: Tensor, nats: float) -
             return None
         # Ahead of a view that changed its group it would be in neither one, and change again.
         ahead = _AHEAD if torch.equal(second, before) else 0.0
-        views, before = refits.with_own(views.best(second)[second.long()], ahead).lens(), second
-        changes = views.change(views.best(second)[:, None])
-        moved = changes[1] < changes[0]
+        views, before = refits.with_own(views.best(second)[0][second.long()], ahead).lens(), second
+        moved = views.by_group(second) < 0.0
         if refits.rest and torch.equal(moved, second):
             break
         second = moved
@@ -472,10 +529,10 @@ def _two_cameras(refits: _Refits, views: _ByView, second: Tensor, nats: float) -
     likelier = refits.nats(views) + float(views.fall(second) - 0.5 * unlikely.square().sum()) - parted.price
     if likelier < nats + WORTH:
         return None
-    changes = views.change(parted.both[:, None])
+    by_group = views.by_group(second)
     groups = TwoCameras(
         second=second,
-        clear=0.5 * torch.where(second, changes[0] - changes[1], changes[1] - changes[0]),
+        clear=0.5 * torch.where(second, -by_group, by_group),
         change=change,
         sigma=parted.covariance.diagonal().sqrt(),
         turned=_mirrored(change, parted.covariance, fit.state.parameters[2:4] + parted.both[0, 1:], fit),
@@ -562,13 +619,16 @@ def _evidence_at(fit: HybridFit, tempering: float) -> float:
 
 def _of_fit(fit: HybridFit, pixels: Tensor, theta: Tensor) -> _ByView:
     """Of a fit's views, about no motion and no θ; `theta` (V, 3) was taken away from the pixels."""
-    shapes, noise = fit.board_shapes.shapes[:_SIZE], max(fit.sigma / math.sqrt(fit.tempering), LEAST_NOISE)
-    problem = _problem(fit, pixels, _INDICES, shapes)
+    # Errors that repeat within a view count less: a lens that does not quite fit is none that moves.
+    shapes, noise = fit.board_shapes.shapes, max(fit.sigma, LEAST_NOISE)
+    problem = _problem(fit, pixels, hybrid_unknowns(fit.model, fit.square), shapes)
     begin, state = torch.cat([_widths(fit.size), _APART * fit.board_shapes.unit[:_SIZE]]), fit.state
+    deviation = torch.where(fit.half.any(0), fit.families.deviation(fit.expected), 0.0)
     # Numbers of one amplitude have the same logarithm.
     ties = _OTHER + by_number(np.arange(float(len(fit.log_ratio)))).unique(return_inverse=True)[1]
     spread = (noise / fit.stillness.sqrt()).expand_as(state.motion)
-    return _by_view(problem, state._replace(board=theta.new_zeros(len(shapes))), noise, theta, begin, ties, spread)
+    state = state._replace(board=theta.new_zeros(len(shapes)))
+    return _by_view(problem, state, noise, theta, begin, ties, spread, deviation)
 
 
 def _by_view(
@@ -579,17 +639,36 @@ def _by_view(
     begin: Tensor,
     ties: Tensor | None = None,
     spread: Tensor | None = None,
+    deviation: Tensor | None = None,
 ) -> _ByView:
+    """Of what a problem's views show; `deviation` (S,) of the priors of lens and board, zero or None where held."""
     rows, local, motion = problem.corner_rows(state), problem.local_size, state.motion
-    scale = state.parameters[0] * rows[:, local] + state.parameters[1] * rows[:, local + 1]
-    own = rows[:, POSE:local]
+    own, shared, slots = rows[:, POSE:local], rows[:, local:-1], problem.free.slots
+    zoom = state.parameters[0] * shared[:, slots[0]]
+    if slots[1] != slots[0]:
+        zoom = zoom + state.parameters[1] * shared[:, slots[1]]
     if spread is not None:
         own, motion = own * spread[..., None], motion / spread.clamp_min(1e-30)
-    rows = torch.cat([rows[:, :POSE], own, scale[:, None], rows[:, local + 2 :]], 1)
+    lens = torch.cat([zoom[:, None], shared[:, list(slots[2:4])]], 1)
+    bends = shared[:, len(problem.free) :][:, :_SIZE]
+    deviation = theta.new_zeros(problem.unknown_count) if deviation is None else deviation
+    shared = (shared * deviation[:, None])[:, deviation > 0]
+    rows = torch.cat([rows[:, :POSE], own, lens, bends, shared, rows[:, -1:]], 1)
     off, x = without_local(rows, POSE) / noise, torch.cat([motion, theta], 1)
-    gram = off @ off.mT
-    g = gram[:, :-1, -1] - (gram[:, :-1, : x.shape[1]] @ x[..., None])[..., 0]
-    return _ByView(gram[:, :-1, :-1], g, () if ties is None else tuple(ties.tolist()), begin)
+    gram, size = off @ off.mT, x.shape[1] + bends.shape[1]
+    x = torch.nn.functional.pad(x, (0, bends.shape[1]))[..., None]
+    N, C = gram[:, :size, :size], gram[:, :size, size:-1]
+    g = gram[:, :size, -1] - (N @ x)[..., 0]
+    # There is no better lens and board than those of the state.
+    H = gram[:, size:-1, size:-1].sum(0) + torch.eye(C.shape[-1], dtype=torch.float64)
+    return _ByView(N, g, *_unit_weight(H, C, -(C.mT @ x)[..., 0]), () if ties is None else tuple(ties.tolist()), begin)
+
+
+def _unit_weight(H: Tensor, C: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """C (V, X, S) and b (V, S) by combinations of unit weight of unknowns whose products are H (S, S)."""
+    both = torch.cat([C, b[:, None]], 1)
+    both = torch.linalg.solve_triangular(torch.linalg.cholesky(H), both.mT, upper=False).mT
+    return both[:, :-1], both[:, -1]
 
 
 def _widths(size: tuple[int, int]) -> Tensor:

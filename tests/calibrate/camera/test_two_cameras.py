@@ -222,15 +222,32 @@ def test_a_phone_with_a_stabilizer(kcal_data: Path) -> None:
 
 
 def test_amplitudes_from_quadratic_forms() -> None:
-    """Those of largest evidence are those with which views were drawn; what is not there has none."""
+    """Those of largest evidence are those with which views were drawn, beside unknowns of all; what is none is zero."""
     draw = torch.Generator().manual_seed(5)
     count, true = 400, torch.tensor([0.0, 20.0, 20.0], dtype=torch.float64)
-    root = torch.randn(count, 6, 3, dtype=torch.float64, generator=draw) * torch.tensor([1e3, 0.1, 0.1])
-    N, theta = root.mT @ root, true * torch.randn(count, 3, dtype=torch.float64, generator=draw)
-    noise = (root.mT @ torch.randn(count, 6, 1, dtype=torch.float64, generator=draw))[..., 0]
-    views = module._ByView(N, noise - (N @ theta[..., None])[..., 0], (), torch.tensor([0.1, 30.0, 30.0]).double())
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, dtype=torch.float64, generator=draw)
+
+    root, theta, noise = normal(count, 6, 3) * torch.tensor([1e3, 0.1, 0.1]), true * normal(count, 3), normal(count, 6)
+    shared, y = normal(count, 6, 2) + root[..., 1:] / 0.1, torch.tensor([3.0, -2.0], dtype=torch.float64)
+    C, H = root.mT @ shared, torch.eye(2, dtype=torch.float64) + (shared.mT @ shared).sum(0)
+    begin = torch.tensor([0.1, 30.0, 30.0], dtype=torch.float64)
+
+    def views_of(theta: Tensor) -> module._ByView:
+        left = (noise - shared @ y)[..., None] - root @ theta[..., None]
+        g, b = (root.mT @ left)[..., 0], (shared.mT @ left)[..., 0]
+        return module._ByView(root.mT @ root, g, *module._unit_weight(H, C, b), (), begin)
+
+    views, still = views_of(theta), views_of(torch.zeros_like(theta))
     center, scale = (views.spread(tied) for tied in module._LENS[:2])
     assert center.nats > scale.nats
     torch.testing.assert_close(center.sigma, true, rtol=0.06, atol=0.0)
-    still = views._replace(g=noise)
     assert max(still.spread(tied).nats for tied in module._LENS) < 0.0
+    best = -torch.linalg.solve(views.N, (views.g + (views.C @ views.others(theta)[:, None])[..., 0])[..., None])[..., 0]
+    assert float(views.total(best)) < float(views.total(1.1 * best))
+    second = torch.arange(count) < 30
+    parted = views_of(torch.where(second[:, None], 40.0 * theta.new_tensor([0.0, 1.0, -1.0]), 0.0))
+    first, other = parted.best(second)[0]
+    torch.testing.assert_close((other - first)[1:], theta.new_tensor([40.0, -40.0]), rtol=0.1, atol=0.0)
+    assert int(((parted.by_group(second) < 0.0) != second).sum()) < 0.1 * count
