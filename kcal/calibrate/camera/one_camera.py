@@ -52,7 +52,7 @@ _LESS = 0.01
 # Standard deviations of a score, from which amplitudes are asked for: of .. clean captures one in .. has more.
 _ASKED = 1.5
 # Share of its price that must be in sight before a camera is fitted again for two groups alone.
-_PROMISED = 0.4
+_PROMISED = 0.6
 # Two values that gain a smaller share of what a spread of values does are not tried: where two cameras were true they
 # gained as much, where a lens moved .5 to .94 of it.
 _BEHIND = 0.8
@@ -109,51 +109,41 @@ class _ByView(NamedTuple):
         H = torch.eye(C.shape[-1], dtype=torch.float64) - shared[..., 1:].sum(0)
         return _ByView(N, g, *_unit_weight(H, C, self.b - shared[..., 0]), (), self.begin[:_SIZE])
 
+    def joint(self) -> tuple[Tensor, Tensor]:
+        """K (V, 3, V, 3) and g (V, 3) of χ² by θ of all views, lens and board at their best: 2 gᵀθ + θᵀKθ."""
+        K = -torch.einsum("vas,wbs->vawb", self.C, self.C)
+        K.diagonal(dim1=0, dim2=2).add_(self.N.permute(1, 2, 0))
+        return K, self.g - self.C @ self.b.sum(0)
+
     def score(self, own: list[int]) -> float:
-        """Standard deviations by which these numbers of θ, were they normal and small, vary more than noise."""
-        C, g = self.C[:, own].flatten(0, 1), self.g[:, own].flatten()
-        K, g = torch.block_diag(*self.N[:, own][..., own]) - C @ C.T, g - C @ self.b.sum(0)
-        return float((g @ g - K.trace()) / (math.sqrt(2.0) * K.norm()))
-
-    def change(self, theta: Tensor, y: Tensor) -> Tensor:
-        """(..., V) of χ² by θ (..., V, 3), or by one for all (..., 1, 3), with this lens and board (..., S)."""
-        each = theta.expand(*theta.shape[:-2], *self.g.shape)
-        slope = self.g + (self.C @ y[..., None, :, None])[..., 0]
-        return (each * (2.0 * slope + (self.N @ each[..., None])[..., 0])).sum(-1)
-
-    def others(self, theta: Tensor) -> Tensor:
-        """(..., S) the best lens and board with θ (..., V, 3)."""
-        return -self.b.sum(0) - (self.C.mT @ theta[..., None])[..., 0].sum(-2)
+        """Standard deviations by which the slopes by these numbers of θ are steeper than by noise alone."""
+        K, g = self.joint()
+        K = K[:, own][..., own]
+        return float((g[:, own].square().sum() - torch.einsum("vava->", K)) / (math.sqrt(2.0) * K.norm()))
 
     def total(self, theta: Tensor) -> Tensor:
-        """(...) the change of χ² by θ (..., V, 3), lens and board at their best."""
-        b = self.b.sum(0)
-        return self.change(theta, torch.zeros_like(b)).sum(-1) - self.others(theta).square().sum(-1) + b @ b
+        """(...) the change of χ² by θ (..., V, 3)."""
+        K, g = self.joint()
+        return ((2.0 * g + torch.einsum("vawb,...wb->...va", K, theta)) * theta).sum((-2, -1))
 
     def best(self, second: Tensor) -> tuple[Tensor, Tensor]:
         """(..., 2, 3) the best θ of both groups and its covariance (..., 6, 6); `second` (..., V): the second group."""
-        groups = torch.stack([~second, second], -2).to(self.g.dtype)
-        g, C = groups @ self.g, (groups @ self.C.flatten(1)).unflatten(-1, self.C.shape[1:]).flatten(-3, -2)
-        N = (groups @ self.N.flatten(1)).unflatten(-1, self.N.shape[1:])
-        apart = torch.eye(2, dtype=torch.float64)[:, None, :, None]
-        N = (apart * N[..., None, :]).flatten(-4, -3).flatten(-2) - C @ C.mT
-        slope, unit = g.flatten(-2)[..., None] - C @ self.b.sum(0)[:, None], self.begin[:_SIZE].repeat(2)
+        K, g = self.joint()
+        groups, unit = torch.stack([~second, second], -1).to(g.dtype), self.begin[:_SIZE].repeat(2)
+        N = torch.einsum("...vi,vawb,...wj->...iajb", groups, K, groups).flatten(-4, -3).flatten(-2)
         inverse = unit[:, None] * torch.linalg.pinv(unit[:, None] * N * unit, hermitian=True) * unit
-        return (inverse @ -slope).unflatten(-2, (2, _SIZE))[..., 0], inverse
+        return (inverse @ -(groups.mT @ g).flatten(-2)[..., None]).unflatten(-2, (2, _SIZE))[..., 0], inverse
 
     def fall(self, second: Tensor) -> Tensor:
         """(...) half of that by which χ² falls with the best of both groups: nats."""
-        return -0.5 * self.total(self.of_groups(self.best(second)[0], second))
-
-    def of_groups(self, both: Tensor, second: Tensor) -> Tensor:
-        """(..., V, 3) θ of each view, from those of both groups (..., 2, 3)."""
-        return torch.where(second[..., None], both[..., 1:, :], both[..., :1, :])
+        return -0.5 * self.total(_each(self.best(second)[0], second))
 
     def by_group(self, second: Tensor) -> Tensor:
-        """(..., V) of χ² by being in the second group, less that by being in the first one."""
-        both = self.best(second)[0]
-        y = self.others(self.of_groups(both, second))
-        return self.change(both[..., 1:, :], y) - self.change(both[..., :1, :], y)
+        """(..., V) of χ² with each view in the second group, less that with it in the first one."""
+        (K, g), both = self.joint(), self.best(second)[0]
+        slope, apart = g + torch.einsum("vawb,...wb->...va", K, _each(both, second)), both[..., 1, :] - both[..., 0, :]
+        bend = torch.einsum("...a,vavb,...b->...v", apart, K, apart)
+        return 2.0 * (slope @ apart[..., None])[..., 0] + torch.where(second, -bend, bend)
 
     def spread(self, tied: Sequence[int]) -> _Spread:
         """Normal motions and others, whose amplitudes have the largest evidence (by EM); `tied` tells which are one."""
@@ -191,6 +181,11 @@ class _ByView(NamedTuple):
         # A second amplitude must be worth it.
         paid = 0.5 * len(ties[index].unique()) * math.log(len(N)) + WORTH * max(0, *tied)
         return _Spread(float(nats.sum()) - paid, nats, sigma[count:][: len(tied)], each[:, count:])
+
+
+def _each(both: Tensor, second: Tensor) -> Tensor:
+    """(..., V, 3) of each view, from those of both groups (..., 2, 3)."""
+    return torch.where(second[..., None], both[..., 1:, :], both[..., :1, :])
 
 
 class _Spread(NamedTuple):
