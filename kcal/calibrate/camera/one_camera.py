@@ -50,9 +50,9 @@ _OTHER = 10
 # Share of the variances of motions with which the search for amplitudes begins: a lens that moves was taken for motion.
 _LESS = 0.01
 # Standard deviations of a score, from which amplitudes are asked for: of .. clean captures one in .. has more.
-_ASKED = 1.5
+_ASKED = 2.5
 # Share of its price that must be in sight before a camera is fitted again for two groups alone.
-_PROMISED = 0.6
+_PROMISED = 0.7
 # Two values that gain a smaller share of what a spread of values does are not tried: where two cameras were true they
 # gained as much, where a lens moved .5 to .94 of it.
 _BEHIND = 0.8
@@ -70,6 +70,8 @@ _FEWEST, _FEWEST_OTHERS = 6, 2
 # Shares of the image's diagonal that corners of two groups must be apart, beyond which they are of two cameras; a lens
 # that focuses by itself scales images by one to three percent.
 _CERTAIN = 0.008
+# Share of the best known difference between groups, below which one is zero but for rounding.
+_ALIKE = 1e-10
 # Nats by which a view belongs to its group; standard deviations from which a difference is told, and χ² of two
 # numbers that agree.
 _CLEAR, _TOLD, _AGREE = 3.0, 3.0, 9.2
@@ -110,10 +112,12 @@ class _ByView(NamedTuple):
         return _ByView(N, g, *_unit_weight(H, C, self.b - shared[..., 0]), (), self.begin[:_SIZE])
 
     def joint(self) -> tuple[Tensor, Tensor]:
-        """K (V, 3, V, 3) and g (V, 3) of χ² by θ of all views, lens and board at their best: 2 gᵀθ + θᵀKθ."""
-        K = -torch.einsum("vas,wbs->vawb", self.C, self.C)
+        """K (V, 3, V, 3) and g (V, 3) of χ² by θ off its mean, lens and board at their best: 2 gᵀθ + θᵀKθ."""
+        K, g = -torch.einsum("vas,wbs->vawb", self.C, self.C), self.g - self.C @ self.b.sum(0)
         K.diagonal(dim1=0, dim2=2).add_(self.N.permute(1, 2, 0))
-        return K, self.g - self.C @ self.b.sum(0)
+        # The mean is that of the camera, which hardly anything but its prior tells from the lens.
+        K = K - K.mean(0, keepdim=True)
+        return K - K.mean(2, keepdim=True), g - g.mean(0)
 
     def score(self, own: list[int]) -> float:
         """Standard deviations by which the slopes by these numbers of θ are steeper than by noise alone."""
@@ -131,7 +135,7 @@ class _ByView(NamedTuple):
         K, g = self.joint()
         groups, unit = torch.stack([~second, second], -1).to(g.dtype), self.begin[:_SIZE].repeat(2)
         N = torch.einsum("...vi,vawb,...wj->...iajb", groups, K, groups).flatten(-4, -3).flatten(-2)
-        inverse = unit[:, None] * torch.linalg.pinv(unit[:, None] * N * unit, hermitian=True) * unit
+        inverse = unit[:, None] * torch.linalg.pinv(unit[:, None] * N * unit, rtol=_ALIKE, hermitian=True) * unit
         return (inverse @ -(groups.mT @ g).flatten(-2)[..., None]).unflatten(-2, (2, _SIZE))[..., 0], inverse
 
     def fall(self, second: Tensor) -> Tensor:
