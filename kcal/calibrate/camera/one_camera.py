@@ -50,7 +50,7 @@ _OTHER = 10
 # Share of the variances of motions with which the search for amplitudes begins: a lens that moves was taken for motion.
 _LESS = 0.01
 # Standard deviations of a score, from which amplitudes are asked for: of .. clean captures one in .. has more.
-_ASKED = 2.5
+_ASKED = 2.0
 # Share of its price that must be in sight before a camera is fitted again for two groups alone.
 _PROMISED = 0.7
 # Two values that gain a smaller share of what a spread of values does are not tried: where two cameras were true they
