@@ -7,7 +7,7 @@ each capture), half of their variance tremor of 2 to 10 Hz; exposures of 5 to 20
 blur taken again; noise grows along the blur, as the views' covariances say. Optical stabilizer: the image of each view
 is shifted as a whole (standard deviation along each axis); electronic: so too, by hand. Measure: as in
 `scripts.bench.traced_lenses`, where the camera sees infinitely distant points, all over the image, after the best
-turn; of the camera without a shift, and of that of another frame, with a shift of its own.
+turn; of the camera without a shift, and of those of six other frames, each with a shift of its own.
 
 Rigs: two cameras of 1280 x 960 pixels, 25 cm apart, which see twelve boards (9 x 6 corners, 5 cm); noise of 0.1 px;
 hands for each camera its own. The cameras are exact, or calibrated from their sides of the pairs where these have a
@@ -48,7 +48,7 @@ from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import against_truth, bends, simulated, view_of
 from scripts.shared.timing import rms, share
 
-SIGMA = 0.08
+SIGMA, FRAMES = 0.08, 6
 TERMS = ("motion", "bending")
 
 
@@ -114,10 +114,10 @@ def shifts(kind: Kind, count: int, seed: int) -> Tensor:
 def captured(kind: str, views: int, seed: int, fit: str) -> Record:
     """One capture and its calibration."""
     what = KINDS[kind]
-    by_view = shifts(what, views + 1, seed) if what.shift else None
+    by_view = shifts(what, views + FRAMES, seed) if what.shift else None
     case = simulated(seed, views, SIGMA, what.by_hand, bent=what.bent, share=what.share, shifts=by_view)
     start = time.process_time()
-    found = against_truth(case, FITS[fit], None if by_view is None else by_view[-1])
+    found = against_truth(case, FITS[fit], () if by_view is None else by_view[views:])
     spent = time.process_time() - start
     moved = {name: getattr(case.truth, name) for name in ("readout", "exposure", "turning", "speed")}
     return found | moved | {"cpu_s": spent, "blur": float(case.truth.blur.norm(dim=-1).square().nanmean().sqrt())}

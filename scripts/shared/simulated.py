@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import statistics
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -146,15 +148,16 @@ class Shifted(NamedTuple):
         return self.lens.unproject(pixels - self.by)
 
 
-def against_truth(case: Simulated, options: CalibrationOptions, shift: Tensor | None = None) -> Record:
-    """Calibrate, and compare with the true lens all over the image, at infinity; also in a frame with this shift."""
+def against_truth(case: Simulated, options: CalibrationOptions, shifts: Iterable[Tensor] = ()) -> Record:
+    """Calibrate, and compare with the true lens all over the image, at infinity; also in frames with these shifts."""
     try:
         result = calibrate_camera(case.seen, options)
         error = error_at_infinity(result.camera, case.lens)
         found = told(result) | figures(result, case, error.pixels, error.errors)
-        if shift is not None:
-            frame = error_at_infinity(result.camera, Shifted(case.lens, shift))  # type: ignore[arg-type]
-            found["frame"] = figures(result, case, frame.pixels, frame.errors)["everywhere"]
+        frames = [error_at_infinity(result.camera, Shifted(case.lens, own)) for own in shifts]  # type: ignore[arg-type]
+        if frames:
+            inside = (figures(result, case, frame.pixels, frame.errors)["everywhere"] for frame in frames)
+            found["frame"] = statistics.fmean(inside)
     except KcalError as refusal:
         return {"refused": str(refusal)}
     return found | {"rms": error.rms, "valid": error.valid}
