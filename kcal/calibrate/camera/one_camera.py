@@ -49,10 +49,9 @@ _LENS = ((-1, 0, 0, -1, -1, -1), (0, -1, -1, -1, -1, -1), (0, 1, 1, -1, -1, -1))
 _OTHER = 10
 # Share of the variances of motions with which the search for amplitudes begins: a lens that moves was taken for motion.
 _LESS = 0.01
-# Standard deviations of a score from which amplitudes are asked for, and nats that a spread must be worth: of 18
-# simulated captures of still lenses one had more, 3.7 and 4.4; of 9 whose principal points moved by 15 px 8 had at
-# least 2.2 and 7.4.
-_ASKED, _SURE = 2.0, 6.0
+# Standard deviations of a score from which amplitudes are asked for, and nats that these must be worth: of 18 simulated
+# captures of still lenses one had more, 3.7 and 3.1; those whose principal points moved by 15 px mostly 2.2 and 4.6.
+_ASKED, _SURE = 2.0, 4.0
 # Share of its price that must be in sight before a camera is fitted again for two groups alone.
 _PROMISED = 0.7
 # Two values that gain a smaller share of what a spread of values does are not tried: where two cameras were true they
@@ -184,8 +183,8 @@ class _ByView(NamedTuple):
         nats -= M.diagonal().log().sum() / len(nats)
         sigma, each = N.new_zeros(len(ties)), N.new_zeros(len(N), len(ties))
         sigma[index], each[:, index] = root, mean
-        # A second amplitude must be worth it.
-        paid = 0.5 * len(ties[index].unique()) * math.log(len(N)) + WORTH * max(0, *tied)
+        # A second amplitude must be worth it, and a scale, by which a lens that is not quite as modeled seems to move.
+        paid = 0.5 * len(ties[index].unique()) * math.log(len(N)) + WORTH * (max(0, *tied) + (tied[0] >= 0))
         return _Spread(float(nats.sum()) - paid, nats, sigma[count:][: len(tied)], each[:, count:])
 
 
