@@ -50,6 +50,8 @@ def captures(
     """The same views with noise of several sizes, each drawn by itself; `posed_by`: a lens that draws poses sooner."""
     found = capture_corners(posed_by or lens, views, sigma=1.0, seed=seed, fill=fill)
     seen, valid = lens.project(points @ found.rotation.transpose(-1, -2) + found.translation[:, None])
+    # Poses that another lens drew may reach beyond this one's image.
+    valid &= ((seen > -0.5) & (seen < seen.new_tensor(lens.size) - 0.5)).all(-1)
     out = []
     for k, sigma in enumerate(sigmas):
         # Noise of other corners is other noise.
