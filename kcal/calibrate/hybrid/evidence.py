@@ -149,7 +149,7 @@ class Integrated(NamedTuple):
     half: Tensor
 
     def slopes(
-        self, step: Array, inverse: Tensor, deviation: Array, y: Array, variance: float, tempering: float,
+        self, step: Array, covariance: Tensor, deviation: Array, y: Array, variance: float, tempering: float,
         amplitudes: int,
     ) -> Slopes:  # fmt: skip
         """Derivatives of -ln p by the logarithms of the ratios.
@@ -159,7 +159,7 @@ class Integrated(NamedTuple):
 
         Args:
             step: (S,) δ of the best lens and board.
-            inverse: (S, S) Q, QᵀQ being their posterior covariance in units of their priors.
+            covariance: (S, S) their posterior covariance in units of their priors.
             deviation: (S,) standard deviations of these.
             y: (S,) the best lens and board in the same units.
             variance: of the noise.
@@ -167,37 +167,32 @@ class Integrated(NamedTuple):
             amplitudes: number of the ratios.
         """
         own = self.inverse.transpose(1, 2) @ self.inverse  # of motions whose lens and board are known
-        size = len(step)
-        direction = inverse.new_zeros(size + 1, size + 1)
-        direction[:-1, 0], direction[-1, 0] = torch.from_numpy(step), 1.0
-        torch.mul(torch.from_numpy(deviation)[:, None], inverse.T, out=direction[:-1, 1:])
-        reach = matrix_product(self.half.flatten(0, 1), direction).view(self.half.shape)
-        E = matrix_product(self.inverse.transpose(1, 2) / math.sqrt(variance * tempering), reach)
-        mean, others, kept = E[..., 0], E[..., 1:], own.diagonal(dim1=1, dim2=2)
+        scaled = matrix_product(self.inverse.transpose(1, 2) / math.sqrt(variance * tempering), self.half)
+        mean = scaled[..., :-1] @ torch.from_numpy(step) + scaled[..., -1]
+        reach = scaled[..., :-1] * torch.from_numpy(deviation)
+        # A row for each motion, times the covariance of lens and board.
+        spread = matrix_product(reach.flatten(0, 1), covariance).view(reach.shape)
+        kept = own.diagonal(dim1=1, dim2=2)
         # Numbers of one amplitude count together: within a view, and across all views.
         number = torch.from_numpy(amplitudes_of(amplitudes))
-        together = torch.nn.functional.one_hot(number, amplitudes).to(E.dtype).T
-        G = others @ others.transpose(1, 2)
+        together = torch.nn.functional.one_hot(number, amplitudes).to(own.dtype).T
+        G = spread @ reach.transpose(1, 2)
         moment = mean.square() + G.diagonal(dim1=1, dim2=2)
         first = together @ ((1.0 - kept) / tempering - moment).sum(0)
         within = (-0.5 * own.square() / tempering - own * (mean[:, :, None] * mean[:, None]) - own * G).sum(0)
         within.diagonal().add_((0.5 * kept / tempering + 0.5 * moment).sum(0))
-        along = together @ (others * mean[..., None]).sum(0)
-        # Of E times the inverse, a row for each motion, only sums over motions are wanted.
-        mixed = along @ inverse
-        rows = others.flatten(0, 1)
-        if len(rows) ** 2 < amplitudes * size**2:
+        along, mixed = (together @ (rows * mean[..., None]).sum(0) for rows in (reach, spread))
+        if len(mean.flatten()) ** 2 < amplitudes * len(step) ** 2:
             # Few views have fewer rows than there are unknowns.
-            pairs = products_of(rows).square().unflatten(0, others.shape[:2]).unflatten(2, others.shape[:2])
-            across = together @ pairs.sum((0, 2)) @ together.T
-            squared = together @ matrix_product(rows, inverse).square().view(others.shape).sum(0)
+            pairs = matrix_product(spread.flatten(0, 1), reach.flatten(0, 1).T).square()
+            across = together @ pairs.unflatten(0, mean.shape).unflatten(2, mean.shape).sum((0, 2)) @ together.T
         else:
-            parts = others.split(number.bincount().tolist(), 1)
-            spread = torch.stack([products_of(part.flatten(0, 1).T) for part in parts])
-            across = spread.flatten(1) @ spread.flatten(1).T
-            squared = (matrix_product(spread, inverse) * inverse).sum(1)
-        second = 4.0 * (together @ within @ together.T - along @ along.T) - 2.0 * across
-        Y = torch.from_numpy(y)
+            each = number.bincount().tolist()
+            parts = zip(spread.split(each, 1), reach.split(each, 1), strict=True)
+            both = torch.stack([matrix_product(one.flatten(0, 1).T, other.flatten(0, 1)) for one, other in parts])
+            across = both.flatten(1) @ both.mT.flatten(1).T
+        second = 4.0 * (together @ within @ together.T - mixed @ along.T) - 2.0 * across
+        Y, squared = torch.from_numpy(y), together @ spread.square().sum(0)
         by_noise = together @ mean.square().sum(0) + 2.0 * mixed @ Y + squared.sum(-1)
         return Slopes(first.numpy(), second.numpy(), -(2.0 * mixed * Y + squared).numpy(), by_noise.numpy())
 
@@ -302,7 +297,7 @@ class _Posterior(NamedTuple):
         slope: (H + 1,).
         bend: (H + 1, H + 1).
         best: lens and board.
-        inverse: (S, S) Q, QᵀQ their posterior covariance in units of their priors.
+        covariance: (S, S) their posterior covariance in units of their priors.
         by_h: (S, H) derivatives of 2 ln (prior standard deviation) by h.
     """
 
@@ -310,7 +305,7 @@ class _Posterior(NamedTuple):
     slope: np.ndarray
     bend: np.ndarray
     best: _Best
-    inverse: Tensor
+    covariance: Tensor
     by_h: np.ndarray
 
 
@@ -336,8 +331,8 @@ def _posterior(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_vari
     best = _best(data, families, h, log_variance)
     if not math.isfinite(best.value):
         return None
-    Q = torch.linalg.solve_triangular(best.root, torch.eye(len(best.y), dtype=best.root.dtype), upper=False)
-    M, y, s2 = matrix_product(Q.T, Q).numpy(), best.y, math.exp(-log_variance)
+    covariance = torch.cholesky_inverse(best.root)
+    M, y, s2 = covariance.numpy(), best.y, math.exp(-log_variance)
     kept, squared, My = M.diagonal(), M * M, M @ y
     # By a = 2 ln d: -ln p grows by (1 - y² - M) / 2, y by M y da - y da / 2, and M by M² - M (off the diagonal M²).
     by_a = 0.5 * (1.0 - y * y - kept)
@@ -350,7 +345,7 @@ def _posterior(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_vari
     noise = 0.5 * (data.freedom - (len(y) - float(kept.sum())) - rss * s2)
     by_noise = 0.5 * (float(kept.sum()) - float(squared.sum()) + rss * s2) - float(y @ My)
     whole = np.block([[by_h.T @ bend @ by_h + np.diag(by_a @ again), across[:, None]], [across, by_noise]])
-    return _Posterior(best.value, np.append(slope, noise), whole, best, Q, by_h)
+    return _Posterior(best.value, np.append(slope, noise), whole, best, covariance, by_h)
 
 
 # The logarithms of motions' standard deviations over the noise, of views that stand still.
@@ -491,7 +486,7 @@ class EvidenceLoss:
             best = found.best
             own = slice(count, count + motions)
             slopes = integrated.slopes(
-                best.step, found.inverse, best.deviation, best.y, math.exp(log_variance), self._tempering,
+                best.step, found.covariance, best.deviation, best.y, math.exp(log_variance), self._tempering,
                 motions,
             )  # fmt: skip
             slope[own], bend[own, own] = slopes.first, slopes.second
@@ -544,14 +539,16 @@ def evidence_of_motion(
 
     Or some of the amplitudes of views, by their numbers, such as that of bending.
     """
-    log_variance = math.log(best.variance)
     rest = [k for k in range(len(best.log_ratio)) if some is not None and k not in some]
-    losses = []
-    for view, ratios in ((data.only(rest), best.log_ratio[rest]), (data, best.log_ratio)):
-        one = view.integrated(ratios)
-        found = _best(one.data.tempered(tempering), families, best.h.numpy(), log_variance)
-        losses.append(found.value + 0.5 * one.log_determinant / tempering + view.unequal)
-    return losses[0] - losses[1]
+    less = best._replace(log_ratio=best.log_ratio[rest])
+    return loss_at(data.only(rest), less, families, tempering) - loss_at(data, best, families, tempering)
+
+
+def loss_at(data: ViewData, at: Amplitudes, families: PriorFamilies, tempering: float) -> float:
+    """The negative logarithm of the evidence of these amplitudes, without the hyperprior."""
+    one = data.integrated(at.log_ratio)
+    found = _best(one.data.tempered(tempering), families, at.h.numpy(), math.log(at.variance))
+    return found.value + 0.5 * one.log_determinant / tempering + data.unequal
 
 
 def evidence_of_corners(

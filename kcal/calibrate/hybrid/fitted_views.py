@@ -21,6 +21,7 @@ from kcal.calibrate.hybrid.evidence import (
     evidence_of_corners,
     evidence_of_motion,
     expected_maximum,
+    loss_at,
     maximize_evidence,
     overdispersion,
     relative_bends,
@@ -394,13 +395,13 @@ def _with_bending(capture: FittedViews, estimate: Estimate) -> tuple[FittedViews
         return None
     wider = dataclasses.replace(capture, readout=dataclasses.replace(readout, bends=capture.heights))
     bent, best = begin_motion(wider, estimate), estimate.amplitudes
-    data, trials = wider.data(wider.problem(bent), bent), []
-    for sigma in _BENT:
-        ratio = np.append(best.log_ratio, math.log(sigma) - 0.5 * math.log(best.variance))
-        trial, number = best._replace(log_ratio=ratio), [len(ratio) - 1]
-        trials.append((evidence_of_motion(data, trial, estimate.families, estimate.tempering, number), sigma, trial))
-    gained, _, trial = max(trials, key=lambda found: found[:2])
-    return (wider, bent._replace(amplitudes=trial, tempering=1.0)) if gained >= WORTH else None
+    data = wider.data(wider.problem(bent), bent)
+    ratios = np.log(_BENT) - 0.5 * math.log(best.variance)
+    trials = [best._replace(log_ratio=np.append(best.log_ratio, ratio)) for ratio in ratios]
+    losses = [loss_at(data, trial, estimate.families, estimate.tempering) for trial in trials]
+    least = int(np.argmin(losses))
+    stiff = loss_at(data.only(range(len(best.log_ratio))), best, estimate.families, estimate.tempering)
+    return (wider, bent._replace(amplitudes=trials[least], tempering=1.0)) if stiff - losses[least] >= WORTH else None
 
 
 def _with_corners(capture: FittedViews, estimate: Estimate) -> tuple[FittedViews, Estimate] | None:
