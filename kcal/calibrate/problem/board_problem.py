@@ -18,7 +18,7 @@ from kcal.lens.model import LEADING, LensModel, fill_field_columns
 from kcal.lens.pose import nearest_rotation, step_rows
 from kcal.lens.projection import INTRINSICS, Projection, project_components
 from kcal.solve.lm import RobustLoss, State
-from kcal.solve.schur import Products, SchurLinearization, SchurProblem, without_local
+from kcal.solve.schur import Products, SchurLinearization, SchurProblem, matrix_product, without_local
 
 # How a pose takes a step: along a twist, so that long steps of many boards stay close to the linear model.
 
@@ -598,7 +598,8 @@ class BoardProblem(SchurProblem[BoardState]):
         local, right, score, total = Products.of_rows(rows.flatten(-2), L := self.local_size)
         if self.displaced:
             # Corners meet lens, poses and residuals only in their own rows: these products cost little.
-            with_rows = self._by_number(torch.einsum("vsun,vaun->vsan", rows, slopes)).flatten(2)
+            along = rows[:, :, None, 0] * slopes[:, None, :, 0]
+            with_rows = self._by_number(along.addcmul_(rows[:, :, None, 1], slopes[:, None, :, 1])).flatten(2)
             own = self._by_number(torch.einsum("vaun,vbun->vabn", slopes, slopes)).sum(0)
             own = torch.einsum("abn,nm->anbm", own, torch.eye(own.shape[-1], dtype=own.dtype)).flatten(2).flatten(0, 1)
             beside = with_rows[:, L:].sum(0)
@@ -690,10 +691,21 @@ class BoardProblem(SchurProblem[BoardState]):
         second = (self.residuals(ahead) + self.residuals(back) - 2.0 * self.residuals(state)) / _AHEAD**2
         if not bool(second.isfinite().all()):
             return None
-        parts = [(self.rows(state, views) @ second[views, :, None])[..., 0] for views in self._chunks(state)]
-        by_view, L = torch.cat(parts), self.local_size
-        shared, local = linear.solve(by_view[:, L:-1].sum(0)[self.moving], by_view[:, :L], damping)
+        by_view, L = torch.cat([self._slopes(state, second, views) for views in self._chunks(state)]), self.local_size
+        shared, local = linear.solve(by_view[:, L:].sum(0)[self.moving], by_view[:, :L], damping)
         return step[0] - 0.5 * shared, step[1] - 0.5 * local
+
+    def _slopes(self, state: BoardState, residuals: Tensor, views: slice) -> Tensor:
+        """(V, L + S) products of derivatives with residuals (V, R) as of `residuals`, of some views."""
+        rows, slopes = self._own_rows(state, views)
+        corners, motions = residuals[views].split([2 * rows.shape[-1], self.local_size - self.pose], -1)
+        found = matrix_product(rows[:, :-1].flatten(-2), corners[..., None])[..., 0]
+        if self.readout is not None:
+            found[:, self.pose : self.local_size] += self._still.sqrt().expand_as(state.motion)[views] * motions
+        if not self.displaced:
+            return found
+        each = (slopes * corners.unflatten(-1, (2, -1))[:, None]).sum(2)
+        return torch.cat([found, self._by_number(each).flatten(1)], 1)
 
     def tidy(self, state: BoardState) -> BoardState:
         """The state with its rotations made orthonormal again after many small steps."""
