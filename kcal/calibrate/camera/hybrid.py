@@ -10,8 +10,9 @@ one.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -50,7 +51,7 @@ from kcal.calibrate.camera.warnings import (
     pupil_findings,
     spacing_findings,
 )
-from kcal.calibrate.hybrid.fit import AlikeError, FitOptions, FitStart, HybridFit, fit_hybrid, rough_start
+from kcal.calibrate.hybrid.fit import AlikeError, FitOptions, FitStart, HybridFit, fit_hybrid
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding
@@ -71,12 +72,13 @@ def calibrate_hybrid(
     check_views(board, pixels, names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
     if options.reject is not None:
         return _hybrid_without_outliers(observations, options, options.reject, progress)
-    weights, begun = torch.ones_like(pixels[..., 0]), start
+    weights = weigh = None
     if options.weighted and observations.covariances() is not None:
-        size = observations.image_size
-        begun = begun or rough_start(board, pixels, size, weights, options.of_fit(size), progress)
-        weights = corner_weights(observations, begun.residuals)
-    fit = fit_by_options(observations, pixels, weights, begun, options, progress)
+        if start is None:
+            weigh = functools.partial(corner_weights, observations)
+        else:
+            weights = corner_weights(observations, start.residuals)
+    fit = fit_by_options(observations, pixels, weights, start, options, progress, weigh)
     return hybrid_result(observations, fit, options)
 
 
@@ -87,12 +89,14 @@ def fit_by_options(
     start: HybridFit | FitStart | None,
     options: CalibrationOptions,
     progress: Progress,
+    weigh: Callable[[Tensor], Tensor] | None = None,
     **how: Any,
 ) -> HybridFit:
     """Fit a hybrid lens as the options say, and as fields of `FitOptions` do; arguments as of `fit_hybrid`."""
     size = observations.image_size
     own = dataclasses.replace(options.of_fit(size), **how)
-    return fit_hybrid(observations.board.points, pixels, size, weights, own, start=start, progress=progress)
+    points = observations.board.points
+    return fit_hybrid(points, pixels, size, weights, own, start=start, progress=progress, weigh=weigh)
 
 
 def corner_weights(observations: Observations, residuals: Tensor) -> Tensor:

@@ -243,12 +243,9 @@ def settle(
     *,
     start: FitStart | None = None,
     progress: Callable[[str], object] = lambda _: None,
-    rough: bool = False,
+    weigh: Callable[[Tensor], Tensor] | None = None,
 ) -> Rounds:
-    """Settle amplitudes, camera, board, poses and motions, with arguments as of `fit_hybrid`.
-
-    If `rough`, another fit will begin where this one ends, so that it need not converge entirely.
-    """
+    """Settle amplitudes, camera, board, poses and motions, with arguments as of `fit_hybrid`."""
     lens, square, modes, known = options.lens, options.square, options.modes, options.known_board(points)
     if start is not None:
         form = start.estimate.model.hybrid
@@ -277,10 +274,10 @@ def settle(
         corners=options.corners and not exact and not options.robust,
     )
 
-    def run(capture: FittedViews, estimate: Estimate, spent: int, *, cold: bool = False, rough: bool = rough) -> Rounds:
+    def run(capture: FittedViews, estimate: Estimate, spent: int, *, cold: bool = False, rough: bool = False) -> Rounds:
         return run_rounds(capture, estimate, cold=cold, spent=spent, rough=rough, progress=progress)
 
-    def begin(capture: FittedViews, rough: bool = rough) -> Rounds:
+    def begin(capture: FittedViews, rough: bool = False) -> Rounds:
         estimate, steps = fit_base(capture, modes, options.focal, lens)
         progress("base projection")
         if capture.readout is not None:
@@ -307,11 +304,15 @@ def settle(
             return Rounds(capture, capture.readout, estimate, data, math.nan, start.iterations, True)
         return run(capture, estimate, start.iterations)
     undecided = square is None and lens is None
-    # Whether pixels are square is known well enough before amplitudes have converged.
-    rounds = begin(capture, rough or undecided)
-    if rough:
-        # Rounds of such views do not converge, and what they would decide does not matter.
+    # Whether pixels are square, and what residuals are, is known well enough before amplitudes have converged.
+    rounds = begin(capture, undecided or weigh is not None)
+    if weigh is not None:
+        # Rounds of views that are tilted alike do not converge.
         check_tilts(rounds.estimate.state.rotation)
+        errors = rounds.capture.problem(rounds.estimate).pixel_errors(rounds.estimate.state)
+        check_shown(errors)
+        capture = dataclasses.replace(capture, weights=weigh(rounds.capture.by_corner(errors)))
+        rounds = rounds._replace(capture=dataclasses.replace(rounds.capture, weights=capture.weights))
     if undecided:
         score = aspect_score(rounds)
         one = dataclasses.replace(rounds.capture, square=pixels_are_square(score))
@@ -319,13 +320,15 @@ def settle(
         readout, most = rounds.readout, rounds.gained + 0.5 * score**2
         if near is None:
             rounds = begin(dataclasses.replace(one, readout=readout))
-        elif one.square or not rough:
+        else:
             rounds = run(one, near, rounds.steps)
             # Motion along columns and the aspect of pixels look alike: with square pixels it may explain what the
             # aspect did, and that is no more than the nats that the aspect was worth.
             hidden = one.square and one.readout is None and not most < WORTH
             if hidden and readout is not None and motion_is_worth(rounds, readout):
                 rounds = run(dataclasses.replace(one, readout=readout), near, rounds.steps)
+    elif weigh is not None:
+        rounds = run(rounds.capture, rounds.estimate, rounds.steps)
     if capture.readout is not None and columns_may_be_read(rounds):
         by_columns = dataclasses.replace(capture.readout, columns=True)
         other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))
@@ -334,32 +337,6 @@ def settle(
     if lens is None and pupil_recedes(rounds):
         rounds = run(rounds.capture, behind_port(rounds.estimate), rounds.steps)
     return rounds
-
-
-def rough_start(
-    points: Tensor,
-    pixels: Tensor,
-    size: tuple[int, int],
-    weights: Tensor,
-    options: FitOptions | None = None,
-    progress: Callable[[str], object] = lambda _: None,
-) -> FitStart:
-    """Fit roughly, as a start for a fit with other weights: without error bars, and not entirely converged.
-
-    Raises:
-        InputError: as `fit_hybrid`.
-        DegenerateError: likewise.
-    """
-    options = options or FitOptions()
-    rounds = settle(points, pixels, size, weights, options, progress=progress, rough=True)
-    capture, estimate = rounds.capture, rounds.estimate
-    errors = capture.problem(estimate).pixel_errors(estimate.state)
-    check_shown(errors)
-    known = options.known_board(points)
-    if known is not None:
-        state = estimate.state
-        estimate = estimate._replace(state=state._replace(board=known.in_amplitudes(state.board)))
-    return FitStart(estimate, capture.readout, capture.square, capture.by_corner(errors), rounds.steps)
 
 
 def check_shown(errors: Tensor) -> None:
@@ -567,6 +544,7 @@ def fit_hybrid(
     *,
     start: HybridFit | FitStart | None = None,
     progress: Callable[[str], object] = lambda _: None,
+    weigh: Callable[[Tensor], Tensor] | None = None,
 ) -> HybridFit:
     """Fit one camera.
 
@@ -576,8 +554,9 @@ def fit_hybrid(
         size: (width, height) of the image.
         weights: (V, N) by which residuals are multiplied; 0 leaves a corner out. None: all count alike.
         options: what is known beforehand; by default nothing.
-        start: an earlier fit of the same views with other weights or another board, to begin with, or `rough_start`.
+        start: an earlier fit of the same views with other weights or another board, to begin with.
         progress: called after each step.
+        weigh: makes weights (V, N) in place of these from residuals (V, N, 2) of the first rounds, without a start.
 
     Raises:
         InputError: no start explains the corners.
@@ -586,7 +565,7 @@ def fit_hybrid(
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     options = options or FitOptions()
     begun, robust = start.as_start if isinstance(start, HybridFit) else start, options.robust
-    rounds = settle(points, pixels, size, weights, options, start=begun, progress=progress)
+    rounds = settle(points, pixels, size, weights, options, start=begun, progress=progress, weigh=weigh)
     ordered, own, known = points, board_modes(points), options.known_board(points)
     if options.training is not None:
         rounds = train_network(rounds, options.training, progress)
@@ -663,7 +642,7 @@ def fit_hybrid(
         board_shapes=own,
         board_points=off_by(ordered + torch.einsum("b,bkn->nk", state.board, own.shapes), displaced),
         residuals=capture.by_corner(errors),
-        weights=weights,
+        weights=capture.weights,
         weighted_rms=math.nan,
         iterations=rounds.steps + steps,
         converged=rounds.converged,
@@ -673,5 +652,5 @@ def fit_hybrid(
         # With each corner read exactly when it is shown.
         again = fit.residuals_of(pixels)
         residuals = torch.where(again.isfinite() & capture.seen[..., None], again, residuals)
-    weighted = float((weights[..., None] * residuals).square().nansum()) / int(capture.seen.sum())
+    weighted = float((capture.weights[..., None] * residuals).square().nansum()) / int(capture.seen.sum())
     return dataclasses.replace(fit, residuals=residuals, weighted_rms=math.sqrt(weighted))

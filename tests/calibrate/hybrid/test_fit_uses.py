@@ -27,7 +27,7 @@ from kcal.calibrate.hybrid.cameras_fit import (
 )
 from kcal.calibrate.hybrid.evidence import WORTH
 from kcal.calibrate.hybrid.families import LensPrior, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, rough_start
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import _cauchy_weights, moving_residuals
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, evidence, printed_board
 from kcal.calibrate.problem.state import HAND, HAND_SPREAD, Readout
@@ -135,18 +135,6 @@ class TestFits:
 
         wanted = [by_hand(0.118), 2.0 * by_hand(0.236), by_hand(0.118), by_hand(0.118), by_hand(0.9), 0.0, 0.0]
         assert found == pytest.approx(wanted)
-
-    def test_starts_for_fits_under_other_weights(self) -> None:
-        start = rough_start(
-            BOARD.points, shots(), SIZE, torch.ones(9, 48).double(), FitOptions(board="exact", motion=False)
-        )
-        assert start.readout is None
-        assert start.square
-        assert start.iterations > 0
-        assert float(start.residuals.square().mean().sqrt()) == pytest.approx(0.1, rel=0.1)
-        found, wanted = (state.parameters[[0, 2, 3]] for state in (start.estimate.state, fitted().state))
-        sigma = fitted().half.square().sum(0).sqrt()[:3]
-        assert float(((found - wanted) / sigma).abs().max()) < 1.5
 
 
 class TestStarts:

@@ -22,7 +22,7 @@ from kcal.calibrate.hybrid.evidence import (
     with_tempering,
 )
 from kcal.calibrate.hybrid.families import PriorFamilies, prior_families, typical_hyperprior
-from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid, rough_start
+from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.problem.state import BoardState
 from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.model import HybridForm
@@ -382,20 +382,35 @@ def test_a_fit_begins_where_another_has_settled() -> None:
     pixels = views(truth(), 12, 3)
     weights = torch.ones(pixels.shape[:2], dtype=torch.float64)
     weights[2, 5] = 0.0
-    start, whole = rough_start(BOARD.points, pixels, SIZE, weights), fit_hybrid(BOARD.points, pixels, SIZE, weights)
-    assert bool(start.residuals[2, 5].isnan().all())
-    assert int(start.residuals.isnan().sum()) == 2
-    rms = float(start.residuals.square().sum(-1).nanmean().sqrt())
-    assert rms == pytest.approx(whole.rms, rel=5e-3)
-    found = fit_hybrid(BOARD.points, pixels, SIZE, weights, start=start)
+    whole = fit_hybrid(BOARD.points, pixels, SIZE, weights)
+    assert bool(whole.residuals[2, 5].isnan().all())
     again = fit_hybrid(BOARD.points, pixels, SIZE, weights, start=whole)
-    for fit in (found, again):
-        spread = whole.covariance.diagonal().sqrt().clamp_min(1e-12)
-        assert float(((fit.camera.params - whole.camera.params) / spread).abs().max()) < 0.1
+    spread = whole.covariance.diagonal().sqrt().clamp_min(1e-12)
+    assert float(((again.camera.params - whole.camera.params) / spread).abs().max()) < 0.1
     # It begins at the end of the rounds, and not at the base projection.
-    assert start.iterations < found.iterations < 2 * start.iterations
+    assert again.iterations < 2 * whole.iterations
     with pytest.raises(InputError, match="no start explains"):
-        rough_start(BOARD.points, torch.full_like(pixels, torch.nan), SIZE, weights)
+        fit_hybrid(BOARD.points, torch.full_like(pixels, torch.nan), SIZE, weights)
+
+
+def test_weights_follow_residuals_of_the_first_rounds() -> None:
+    pixels = views(truth(), 12, 3)
+    given = torch.ones(pixels.shape[:2], dtype=torch.float64)
+    given[:, ::2] = 0.3
+    known, seen = fit_hybrid(BOARD.points, pixels, SIZE, given), []
+
+    def weigh(residuals: torch.Tensor) -> torch.Tensor:
+        seen.append(float(residuals.square().sum(-1).nanmean().sqrt()))
+        return given
+
+    found = fit_hybrid(BOARD.points, pixels, SIZE, weigh=weigh)
+    assert seen == [pytest.approx(known.rms, rel=0.02)]
+    assert torch.equal(found.weights, given)
+    assert found.weighted_rms == pytest.approx(known.weighted_rms, rel=1e-3)
+    spread = known.covariance.diagonal().sqrt().clamp_min(1e-12)
+    assert float(((found.camera.params - known.camera.params) / spread).abs().max()) < 0.1
+    plain = fit_hybrid(BOARD.points, pixels, SIZE)
+    assert float(((plain.camera.params - known.camera.params) / spread).abs().max()) > 0.2
 
 
 def test_a_lens_seen_in_a_ring_alone_comes_to_rest() -> None:
