@@ -150,21 +150,23 @@ def behind_port(estimate: Estimate) -> Estimate:
 # Degrees of one direction within which all boards are alike: halves of 49 views within 5.1 gave 999 ± 31 and
 # 589 ± 14 px; those of 25 views within 7.2 agree within their error bars.
 _ALIKE = 6.0
+# The same in the first rounds, which are not converged: later ones of such views drift on.
+_SURELY_ALIKE = 5.7
 
 
 class AlikeError(DegenerateError):
     """All boards are tilted alike, as those of any part of the views then are."""
 
 
-def check_tilts(rotation: Tensor) -> None:
-    """Raise `AlikeError` where all views (V, 3, 3), cam_from_board, show the board tilted alike.
+def check_tilts(rotation: Tensor, within: float = _ALIKE) -> None:
+    """Raise `AlikeError` where all views (V, 3, 3), cam_from_board, show the board tilted alike within these degrees.
 
     Whatever shape of the print or of the lens that tilts all of them alike is then taken for the focal length.
     """
     normals = torch.nn.functional.normalize(rotation[..., 2] * rotation[..., 2, 2:].sign(), dim=-1)
     middle = torch.nn.functional.normalize(normals.sum(0), dim=0)
     apart = float(torch.rad2deg(torch.acos((normals @ middle).clamp(max=1.0))).max())
-    if apart < _ALIKE:
+    if apart < within:
         raise AlikeError(
             f"the board is tilted alike in all {len(rotation)} views (within {apart:.1f}° of one direction): they do "
             "not determine the focal length, which other views of the same kind give otherwise; add views with the "
@@ -274,8 +276,8 @@ def settle(
         corners=options.corners and not exact and not options.robust,
     )
 
-    def run(capture: FittedViews, estimate: Estimate, spent: int, *, cold: bool = False, rough: bool = False) -> Rounds:
-        return run_rounds(capture, estimate, cold=cold, spent=spent, rough=rough, progress=progress)
+    def run(capture: FittedViews, estimate: Estimate, spent: int) -> Rounds:
+        return run_rounds(capture, estimate, spent=spent, progress=progress)
 
     def begin(capture: FittedViews, rough: bool = False) -> Rounds:
         estimate, steps = fit_base(capture, modes, options.focal, lens)
@@ -284,7 +286,12 @@ def settle(
             distance = float(estimate.state.translation.norm(dim=-1).median())
             readout = dataclasses.replace(capture.readout, distance=distance)
             capture = dataclasses.replace(capture, readout=readout)
-        return run(capture, estimate, steps, cold=True, rough=rough)
+        check = None if weigh is None else tilted
+        return run_rounds(capture, estimate, cold=True, spent=steps, rough=rough, progress=progress, reweigh=check)
+
+    def tilted(capture: FittedViews, estimate: Estimate) -> FittedViews:
+        check_tilts(estimate.state.rotation, _SURELY_ALIKE)
+        return capture
 
     if start is not None:
         estimate = start.estimate
@@ -307,7 +314,6 @@ def settle(
     # Whether pixels are square, and what residuals are, is known well enough before amplitudes have converged.
     rounds = begin(capture, undecided or weigh is not None)
     if weigh is not None:
-        # Rounds of views that are tilted alike do not converge.
         check_tilts(rounds.estimate.state.rotation)
         errors = rounds.capture.problem(rounds.estimate).pixel_errors(rounds.estimate.state)
         check_shown(errors)

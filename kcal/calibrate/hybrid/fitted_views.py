@@ -17,6 +17,7 @@ from kcal.calibrate.hybrid.evidence import (
     NO_MOTION,
     WORTH,
     Amplitudes,
+    EvidenceLoss,
     ViewData,
     evidence_of_corners,
     evidence_of_motion,
@@ -583,14 +584,19 @@ def columns_may_be_read(rounds: Rounds) -> bool:
     found = motion_sigma(estimate.amplitudes.log_ratio, estimate.amplitudes.variance)
     if not rounds.converged or max(found.turn, found.shift) > _TOO_MUCH:
         return True
-    losses = []
     still = estimate._replace(state=estimate.state._replace(motion=torch.zeros_like(estimate.state.motion)))
-    for columns in (False, True):
-        capture = dataclasses.replace(rounds.capture, readout=dataclasses.replace(readout, columns=columns))
-        data = capture.data(capture.problem(estimate), still)
-        best = maximize_evidence(data, estimate.families, estimate.amplitudes, capture.hyperprior, rough=True)
-        losses.append(best.loss)
-    return losses[1] < losses[0]
+    by_rows, by_columns = (
+        capture.data(capture.problem(estimate), still)
+        for capture in (
+            dataclasses.replace(rounds.capture, readout=dataclasses.replace(readout, columns=columns))
+            for columns in (False, True)
+        )
+    )
+    prior, families, amplitudes = rounds.capture.hyperprior, estimate.families, estimate.amplitudes
+    # Amplitudes are the best ones for rows already.
+    at = np.concatenate([amplitudes.h.numpy(), amplitudes.log_ratio, [math.log(amplitudes.variance)]])
+    best = maximize_evidence(by_columns, families, amplitudes, prior, rough=True)
+    return best.loss < EvidenceLoss(by_rows, families, prior, 1.0).value(at)
 
 
 def _moved_by(old: Amplitudes, new: Amplitudes) -> float:
