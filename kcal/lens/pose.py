@@ -80,11 +80,25 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
     vector = as_tensor("vector", vector)
     if vector.shape[-1:] != (3,):
         raise InputError(f"vector: shape (..., 3) is needed, got {tuple(vector.shape)}")
-    # Here and below: kornia takes long to load.
-    from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    sine, first, _ = (each[..., None] for each in turn_series((vector * vector).sum(-1, keepdim=True)))
+    return torch.eye(3, dtype=vector.dtype, device=vector.device) + sine * cross + first * (cross @ cross)
 
-    flat: Tensor = axis_angle_to_rotation_matrix(vector.reshape(-1, 3))
-    return flat.reshape(*vector.shape, 3)
+
+def turn_series(square: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sin a / a, (1 - cos a) / a² and (a - sin a) / a³ of a² (...), by their series where these would cancel.
+
+    Source: O. Rodrigues 1840; Murray, Li, Sastry: A Mathematical Introduction to Robotic Manipulation, Eq. 2.14.
+    """
+    near = square < 1e-4
+    far = torch.where(near, 1.0, square)
+    angle = far.sqrt()
+    sine = torch.where(near, 1.0 - square * (1.0 - square / 20.0) / 6.0, torch.sin(angle) / angle)
+    first = torch.where(near, 0.5 - square * (1.0 - square / 30.0) / 24.0, (1.0 - torch.cos(angle)) / far)
+    second = torch.where(near, (1.0 - square * (1.0 - square / 42.0) / 20.0) / 6.0, (1.0 - sine) / far)
+    return sine, first, second
 
 
 def vector_from_rotation(rotation: Tensor) -> Tensor:
@@ -97,6 +111,7 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
     rotation = as_tensor("rotation", rotation)
     if rotation.shape[-2:] != (3, 3):
         raise InputError(f"rotation: shape (..., 3, 3) is needed, got {tuple(rotation.shape)}")
+    # kornia takes long to load.
     from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
     flat: Tensor = rotation_matrix_to_axis_angle(rotation.reshape(-1, 3, 3))

@@ -15,7 +15,7 @@ from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior, Ter
 from kcal.calibrate.problem.state import BoardState, Readout, warp_modes
 from kcal.gaussian import triangular
 from kcal.lens.model import LEADING, LensModel, fill_field_columns
-from kcal.lens.pose import nearest_rotation, step_rows
+from kcal.lens.pose import nearest_rotation, step_rows, turn_series
 from kcal.lens.projection import INTRINSICS, Projection, project_components
 from kcal.solve.lm import RobustLoss, State
 from kcal.solve.schur import Products, SchurLinearization, SchurProblem, matrix_product, without_local
@@ -46,14 +46,7 @@ def apply_twist(rotation: Tensor, translation: Tensor, step: Tensor) -> tuple[Te
     """
     turn, shift = step[..., :3], step[..., 3:]
     along = shift - torch.linalg.cross(turn, translation)
-    square = (turn * turn).sum(-1, keepdim=True)
-    near = square < 1e-4
-    far = torch.where(near, 1.0, square)
-    angle = far.sqrt()
-    # sin a / a, (1 - cos a) / a² and (a - sin a) / a³, by their series where these would cancel.
-    sine = torch.where(near, 1.0 - square * (1.0 - square / 20.0) / 6.0, torch.sin(angle) / angle)
-    first = torch.where(near, 0.5 - square * (1.0 - square / 30.0) / 24.0, (1.0 - torch.cos(angle)) / far)
-    second = torch.where(near, (1.0 - square * (1.0 - square / 42.0) / 20.0) / 6.0, (1.0 - sine) / far)
+    sine, first, second = turn_series((turn * turn).sum(-1, keepdim=True))
     # exp([ω]×) and its integral as linear maps of all columns at once: R, t, and the shift.
     columns = torch.cat([rotation, translation[..., None], along[..., None]], -1)
     turned = torch.linalg.cross(turn[..., None].expand_as(columns), columns, dim=-2)
