@@ -201,7 +201,7 @@ class Drift:
         left: (3,) turn of the left camera; None where only the relative attitude can be told.
         right: (3,) of the right camera; likewise.
         relative: (3,) of right_from_left about the right camera's axes, as in
-            `kcal.calibrate.problem.board_problem.apply_twist`.
+            `kcal.lens.pose.apply_twist`.
         left_covariance: (3, 3), None as above.
         right_covariance: (3, 3), None as above.
         relative_covariance: (3, 3).

@@ -14,10 +14,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kcal.calibrate.problem.board_problem import apply_twist
 from kcal.checks import as_points
 from kcal.errors import InputError
-from kcal.lens.pose import step_rows
+from kcal.lens.pose import apply_twist, step_rows
 from kcal.nets.inverse import (
     Network,
     Widths,

@@ -368,6 +368,11 @@ class Amplitudes(NamedTuple):
     log_ratio: np.ndarray = NO_MOTION
     loss: float = math.inf
 
+    @property
+    def vector(self) -> np.ndarray:
+        """All but the loss: h, logarithms of ratios of motions, ln σ²."""
+        return np.concatenate([self.h.numpy(), self.log_ratio, [math.log(self.variance)]])
+
 
 def maximize_evidence(
     data: ViewData,
@@ -394,10 +399,8 @@ def maximize_evidence(
     bounds = hyper_bounds(prior, len(start.log_ratio), log_variance)
     if known_noise:
         bounds[-1] = log_variance, log_variance
-    begin = np.concatenate([start.h.numpy(), start.log_ratio, [log_variance]])
-    at, value = _minimum(
-        EvidenceLoss(data, families, prior, tempering), begin, bounds, *(_ROUGHLY if rough else _EXACTLY)
-    )
+    loss = EvidenceLoss(data, families, prior, tempering)
+    at, value = _minimum(loss, start.vector, bounds, *(_ROUGHLY if rough else _EXACTLY))
     return Amplitudes(torch.from_numpy(at[:count].copy()), math.exp(at[-1]), at[count:-1].copy(), float(value))
 
 
@@ -623,7 +626,7 @@ def expected_maximum(
     used = families.amplitude
     which = [*used[used >= 0].unique().tolist(), *range(count, count + len(best.log_ratio))]
     loss = EvidenceLoss(data, families, hyperprior, tempering)
-    at = np.concatenate([best.h.numpy(), best.log_ratio, [log_variance]])
+    at = best.vector
     value, _, bend = loss(at)
     if not math.isfinite(value):
         raise ArithmeticError("the views contradict each other so far that the evidence of their lens is no number")
@@ -646,7 +649,7 @@ def steps_of_amplitudes(
     the best hyperparameters lacks the sum of the rows' outer products (Kass and Steffey 1989).
     """
     loss, log_variance = EvidenceLoss(data, families, hyperprior, tempering), math.log(best.variance)
-    at = np.concatenate([best.h.numpy(), best.log_ratio, [log_variance]])
+    at = best.vector
     low, high = np.array(hyper_bounds(hyperprior, len(best.log_ratio), log_variance), dtype=float).T
     values, vectors = np.linalg.eigh(_inverse(loss(at)[2]))
     away = (np.sqrt(values) * vectors).T

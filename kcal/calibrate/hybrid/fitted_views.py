@@ -594,9 +594,8 @@ def columns_may_be_read(rounds: Rounds) -> bool:
     )
     prior, families, amplitudes = rounds.capture.hyperprior, estimate.families, estimate.amplitudes
     # Amplitudes are the best ones for rows already.
-    at = np.concatenate([amplitudes.h.numpy(), amplitudes.log_ratio, [math.log(amplitudes.variance)]])
     best = maximize_evidence(by_columns, families, amplitudes, prior, rough=True)
-    return best.loss < EvidenceLoss(by_rows, families, prior, 1.0).value(at)
+    return best.loss < EvidenceLoss(by_rows, families, prior, 1.0).value(amplitudes.vector)
 
 
 def _moved_by(old: Amplitudes, new: Amplitudes) -> float:

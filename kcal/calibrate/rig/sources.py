@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from kcal.calibrate.problem.board_problem import BoardProblem, apply_twist
+from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import MOTION, BoardState, Readout
 from kcal.calibrate.problem.views import Views, refine_poses, spread_out, whitening
 from kcal.calibrate.rig.marks import Features, Landmarks, SkylineSource, StarSource
@@ -36,7 +36,7 @@ from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.lens.calibration import ItemResidual
 from kcal.lens.camera import Camera
-from kcal.lens.pose import Pose
+from kcal.lens.pose import Pose, apply_twist
 from kcal.lens.projection import project_components
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief

@@ -67,7 +67,11 @@ class TestColumns:
         def maximum(columns: bool, *_: object, **__: object) -> SimpleNamespace:
             return SimpleNamespace(loss=losses[columns])
 
+        def at_rows(columns: bool, *_: object) -> SimpleNamespace:
+            return SimpleNamespace(value=lambda _: losses[columns])
+
         monkeypatch.setattr(fitted_views, "maximize_evidence", maximum)
+        monkeypatch.setattr(fitted_views, "EvidenceLoss", at_rows)
         assert self.asked(-3.0) is better
         assert self.asked(-3.0, readout=None) is False
         # There is no solution near which anything could be asked.

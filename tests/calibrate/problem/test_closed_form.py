@@ -12,7 +12,6 @@ from torch import Tensor
 
 from kcal import Board, Camera, InputError
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
-from kcal.calibrate.problem.board_problem import apply_twist
 from kcal.calibrate.problem.parameters import CoefficientPrior, is_overparameterized
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import (
@@ -28,6 +27,7 @@ from kcal.calibrate.problem.views import (
 )
 from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.camera_parameters import parameter_names
+from kcal.lens.pose import apply_twist
 from kcal.lens.projection import project_components
 from kcal.solve import LMOptions
 

@@ -9,11 +9,12 @@ from torch import Tensor
 
 from kcal import InputError, Observations
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.problem.board_problem import BoardProblem, apply_twist
+from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FoldBarrier, GaussianPrior, Term
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import free_parameters, whitening
 from kcal.lens import LensModel, rotation_from_vector
+from kcal.lens.pose import apply_twist
 from kcal.solve import RobustLoss
 from kcal.solve.lm import LMOptions, minimize
 

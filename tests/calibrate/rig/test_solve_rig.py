@@ -72,7 +72,7 @@ def off(found: RigResult) -> float:
 
 
 def pose_error(found: RigResult) -> Tensor:
-    """(6,) of the relative pose, as `kcal.calibrate.problem.board_problem.apply_twist` counts it."""
+    """(6,) of the relative pose, as `kcal.lens.pose.apply_twist` counts it."""
     rotation = ROTATION[1] @ ROTATION[0].T
     rig = found.stereo()
     shift = rig.right_from_left_translation - ROTATION[1] @ (CENTER[0] - CENTER[1])
