@@ -276,10 +276,12 @@ def settle(
         corners=options.corners and not exact and not options.robust,
     )
 
-    def run(capture: FittedViews, estimate: Estimate, spent: int) -> Rounds:
-        return run_rounds(capture, estimate, spent=spent, progress=progress)
+    rough = weigh is not None
 
-    def begin(capture: FittedViews, rough: bool = False) -> Rounds:
+    def run(capture: FittedViews, estimate: Estimate, spent: int, rough: bool = rough) -> Rounds:
+        return run_rounds(capture, estimate, spent=spent, rough=rough, progress=progress)
+
+    def begin(capture: FittedViews, rough: bool = rough) -> Rounds:
         estimate, steps = fit_base(capture, modes, options.focal, lens)
         progress("base projection")
         if capture.readout is not None:
@@ -311,14 +313,11 @@ def settle(
             return Rounds(capture, capture.readout, estimate, data, math.nan, start.iterations, True)
         return run(capture, estimate, start.iterations)
     undecided = square is None and lens is None
-    # Whether pixels are square, and what residuals are, is known well enough before amplitudes have converged.
-    rounds = begin(capture, undecided or weigh is not None)
-    if weigh is not None:
+    # Whether pixels are square is known well enough before amplitudes have converged.
+    rounds = begin(capture, rough or undecided)
+    if rough:
+        # Rounds of such views do not converge, and what they would decide does not matter.
         check_tilts(rounds.estimate.state.rotation)
-        errors = rounds.capture.problem(rounds.estimate).pixel_errors(rounds.estimate.state)
-        check_shown(errors)
-        capture = dataclasses.replace(capture, weights=weigh(rounds.capture.by_corner(errors)))
-        rounds = rounds._replace(capture=dataclasses.replace(rounds.capture, weights=capture.weights))
     if undecided:
         score = aspect_score(rounds)
         one = dataclasses.replace(rounds.capture, square=pixels_are_square(score))
@@ -326,15 +325,13 @@ def settle(
         readout, most = rounds.readout, rounds.gained + 0.5 * score**2
         if near is None:
             rounds = begin(dataclasses.replace(one, readout=readout))
-        else:
+        elif one.square or not rough:
             rounds = run(one, near, rounds.steps)
             # Motion along columns and the aspect of pixels look alike: with square pixels it may explain what the
             # aspect did, and that is no more than the nats that the aspect was worth.
             hidden = one.square and one.readout is None and not most < WORTH
             if hidden and readout is not None and motion_is_worth(rounds, readout):
                 rounds = run(dataclasses.replace(one, readout=readout), near, rounds.steps)
-    elif weigh is not None:
-        rounds = run(rounds.capture, rounds.estimate, rounds.steps)
     if capture.readout is not None and columns_may_be_read(rounds):
         by_columns = dataclasses.replace(capture.readout, columns=True)
         other = begin(dataclasses.replace(capture, square=rounds.capture.square, readout=by_columns))
@@ -342,7 +339,14 @@ def settle(
             rounds = other
     if lens is None and pupil_recedes(rounds):
         rounds = run(rounds.capture, behind_port(rounds.estimate), rounds.steps)
-    return rounds
+    if weigh is None:
+        return rounds
+    capture, estimate = rounds.capture, rounds.estimate
+    errors = capture.problem(estimate).pixel_errors(estimate.state)
+    check_shown(errors)
+    # How the board bends was asked under the first weights.
+    capture = dataclasses.replace(capture, weights=weigh(capture.by_corner(errors)), heights=None)
+    return run(capture, estimate, rounds.steps, rough=False)
 
 
 def check_shown(errors: Tensor) -> None:

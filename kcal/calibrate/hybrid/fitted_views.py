@@ -505,8 +505,7 @@ def run_rounds(
             weighed = reweigh(capture, estimate)
             resting &= torch.equal(weighed.weights, capture.weights)
             capture = weighed
-        # A rough fit is followed by one that asks again.
-        if (first or (resting and not rough)) and turn < _ROUNDS // 2:
+        if (first or resting) and turn < _ROUNDS // 2:
             bent = _with_bending(capture, estimate)
             if bent is not None:
                 (capture, estimate), top = bent, None
@@ -522,6 +521,7 @@ def run_rounds(
                 capture = dataclasses.replace(capture, readout=less if less.numbers else None, heights=heights)
                 estimate = begin_motion(capture, estimate)
                 continue
+        # A rough fit is followed by one that asks.
         if (resting or turn == _ROUNDS // 2) and not rough and turn < _ROUNDS - _ANEW:
             other = _with_corners(capture, estimate)
             if other is not None:
