@@ -475,7 +475,7 @@ def _paired(
         shapes = [some.shape for some in images]
         if shapes != [(len(near), *camera.size[::-1]) for camera in (rig.left, rig.right)]:
             raise InputError("association: images of the cameras' sizes are needed, one of each for each time step")
-        for one, first, second, left, right in zip(cost, *boxes, *images, strict=True):
+        for one, first, second, left, right in zip(cost, *boxes, *images, strict=True) if len(rows) else ():
             gray = as_gray("left image", left), as_gray("right image", right)
             looks = torch.cat([appearance(gray[0], first, gray[1], some) for some in second.split(64)], 1)
             one += ((1.0 - looks) / _LOOKS_SPREAD).square()

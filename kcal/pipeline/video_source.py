@@ -380,12 +380,14 @@ class VideoCounts:
         paired: groups of frames that the detector saw.
         undecoded: frames that were damaged or out of order.
         dropped: groups of a live source for which there was no time.
+        strangers: pairs of frames with boxes in both, none of which is of one object.
     """
 
     frames: dict[str, int]
     paired: int = 0
     undecoded: int = 0
     dropped: int = 0
+    strangers: int = 0
 
     def __str__(self) -> str:
         each = [f"{count:,}" for count in self.frames.values()]
@@ -394,6 +396,7 @@ class VideoCounts:
         for count, words in (
             (self.undecoded, "damaged or out of order, left out"),
             (self.dropped, f"{what} dropped for lack of time"),
+            (self.strangers, "with boxes in both, none of one object: are videos and cameras in one order?"),
         ):
             parts += [f"{count:,} {words}"] if count else []
         return "; ".join(parts)
@@ -592,4 +595,5 @@ class Videos:
         assert left is not None and right is not None and one is not None and other is not None  # noqa: PT018
         images = one.gray(), other.gray()
         pairs = pair_objects(self._rig, left, right, images, options=self._options, disparity=self._match)
+        self.counts.strangers += bool(len(left) and len(right) and not len(pairs))
         return dataclasses.replace(pairs, covariance=pairs.covariance + self._compression)

@@ -150,6 +150,20 @@ def test_three_videos_of_three_cameras(tmp_path: Path) -> None:
     assert (tmp_path / "tracks.csv").read_bytes() == whole
 
 
+def nothing(image: np.ndarray) -> list[Box]:
+    return []
+
+
+def test_empty_images_and_exchanged_videos(folder: Path) -> None:
+    assert f"{FRAMES} moments, 0 positions" in live(folder, detector="tests.cli.test_live_videos:nothing")
+    for path in folder.glob("tracks.csv*"):
+        path.unlink()
+    (folder / "left.mp4").rename(folder / "other.mp4")
+    (folder / "right.mp4").rename(folder / "left.mp4")
+    (folder / "other.mp4").rename(folder / "right.mp4")
+    assert "with boxes in both, none of one object: are videos and cameras in one order?" in live(folder)
+
+
 def test_a_shorter_video_ends_the_pairs(folder: Path) -> None:
     times = [number / 15 for number in range(5)]
     write_video(folder / "right.mp4", film(small_rig(), 1, times), times)
