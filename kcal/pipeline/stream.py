@@ -605,7 +605,7 @@ class Stream:
 def lines_of(path: Path | None, read: Callable[[bytes], Moment]) -> Callable[[int], Iterator[SourceItem]]:
     """The lines of a file, or of the standard input if None, as a source; blank ones are skipped.
 
-    A last line without its end is still being written, and is left for the next run.
+    A last line without its end that cannot be read is still being written, and is left for the next run.
 
     Args:
         path: of the file.
@@ -625,9 +625,8 @@ def lines_of(path: Path | None, read: Callable[[bytes], Moment]) -> Callable[[in
                 file.seek(offset)
             while line := file.readline(_LONGEST):
                 offset += len(line)
-                if not line.endswith(b"\n"):
-                    if len(line) < _LONGEST:
-                        return
+                whole = line.endswith(b"\n")
+                if not whole and len(line) == _LONGEST:
                     while (rest := file.readline(_LONGEST)) and not rest.endswith(b"\n"):
                         offset += len(rest)
                     offset += len(rest)
@@ -636,8 +635,11 @@ def lines_of(path: Path | None, read: Callable[[bytes], Moment]) -> Callable[[in
                 if not line.strip():
                     continue
                 try:
-                    yield SourceItem(read(line), offset)
+                    found: Moment | InputError = read(line)
                 except InputError as error:
-                    yield SourceItem(error, offset)
+                    if not whole:
+                        return
+                    found = error
+                yield SourceItem(found, offset)
 
     return items
