@@ -131,22 +131,24 @@ class _ByView(NamedTuple):
         K, g = self.joint()
         return ((2.0 * g + torch.einsum("vawb,...wb->...va", K, theta)) * theta).sum((-2, -1))
 
-    def best(self, second: Tensor) -> tuple[Tensor, Tensor]:
-        """(..., 2, 3) the best θ of both groups and its covariance (..., 6, 6); `second` (..., V): the second group."""
+    def best(self, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The best θ of both groups (..., 2, 3), its covariance (..., 6, 6), and by how many nats it is likelier (...).
+
+        `second` (..., V) tells which views are in the second group.
+        """
         K, g = self.joint()
         groups, unit = torch.stack([~second, second], -1).to(g.dtype), self.begin[:_SIZE].repeat(2)
         N = torch.einsum("...vi,vawb,...wj->...iajb", groups, K, groups).flatten(-4, -3).flatten(-2)
         inverse = unit[:, None] * torch.linalg.pinv(unit[:, None] * N * unit, rtol=_ALIKE, hermitian=True) * unit
-        return (inverse @ -(groups.mT @ g).flatten(-2)[..., None]).unflatten(-2, (2, _SIZE))[..., 0], inverse
-
-    def fall(self, second: Tensor) -> Tensor:
-        """(...) half of that by which χ² falls with the best of both groups: nats."""
-        return -0.5 * self.total(_each(self.best(second)[0], second))
+        slope = (groups.mT @ g).flatten(-2)
+        both = -(inverse @ slope[..., None])[..., 0]
+        return both.unflatten(-1, (2, _SIZE)), inverse, -0.5 * (slope * both).sum(-1)
 
     def by_group(self, second: Tensor) -> Tensor:
         """(..., V) of χ² with each view in the second group, less that with it in the first one."""
         (K, g), both = self.joint(), self.best(second)[0]
-        slope, apart = g + torch.einsum("vawb,...wb->...va", K, _each(both, second)), both[..., 1, :] - both[..., 0, :]
+        theta = torch.where(second[..., None], both[..., 1:, :], both[..., :1, :])
+        slope, apart = g + torch.einsum("vawb,...wb->...va", K, theta), both[..., 1, :] - both[..., 0, :]
         bend = torch.einsum("...a,vavb,...b->...v", apart, K, apart)
         return 2.0 * (slope @ apart[..., None])[..., 0] + torch.where(second, -bend, bend)
 
@@ -186,11 +188,6 @@ class _ByView(NamedTuple):
         # A second amplitude must be worth it, and a scale, by which a lens that is not quite as modeled seems to move.
         paid = 0.5 * len(ties[index].unique()) * math.log(len(N)) + WORTH * (max(0, *tied) + (tied[0] >= 0))
         return _Spread(float(nats.sum()) - paid, nats, sigma[count:][: len(tied)], each[:, count:])
-
-
-def _each(both: Tensor, second: Tensor) -> Tensor:
-    """(..., V, 3) of each view, from those of both groups (..., 2, 3)."""
-    return torch.where(second[..., None], both[..., 1:, :], both[..., :1, :])
 
 
 class _Spread(NamedTuple):
@@ -395,7 +392,7 @@ def own_lenses(
         second = _grouped(held, held.spread(_LENS[-1]).mean, fit.size)
         if not _FEWEST_OTHERS <= int(second.sum()) <= len(second) - _FEWEST_OTHERS:
             return None
-        if about.fall(second) < _PROMISED * _Parted.of(about, second, fit.size).price:
+        if about.best(second)[2] < _PROMISED * _parted(about, second, fit.size)[2]:
             return None
     else:
         for turn in range(_ROUNDS):
@@ -409,7 +406,7 @@ def own_lenses(
         second = _grouped(about, found.mean, fit.size)
         if nats >= _SURE:
             normal = OwnLenses(fit=refits.widened(found.sigma), sigma=found.sigma, theta=refits.theta, nats=nats)
-            if about.fall(second) < _BEHIND * found.nats:
+            if about.best(second)[2] < _BEHIND * found.nats:
                 return normal
     return _two_cameras(refits, about, second, max(nats, 0.0)) or normal
 
@@ -467,30 +464,18 @@ class _Refits:
         return gained + 0.5 * float(views.total(self.theta)) - 2.0 * float((counts * self.theta[:, 0]).sum())
 
 
-class _Parted(NamedTuple):
-    """What parts two groups of views.
+def _parted(views: _ByView, second: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor, float]:
+    """The best θ of two groups (2, 3), the covariance (3, 3) of their difference, and the price of both in nats.
 
-    Attributes:
-        both: (2, 3) the best θ of each.
-        covariance: (3, 3) of their difference.
-        price: nats of the choice of these numbers, and of a group for each view.
+    The price is that of these numbers, and of a group for each view; `second` (V,) is one of them.
     """
-
-    both: Tensor
-    covariance: Tensor
-    price: float
-
-    @classmethod
-    def of(cls, views: _ByView, second: Tensor, size: tuple[int, int]) -> _Parted:
-        """Of groups of which `second` (V,) is one."""
-        both, of_both = views.best(second)
-        difference = torch.cat([-torch.eye(_SIZE, dtype=torch.float64), torch.eye(_SIZE, dtype=torch.float64)], 1)
-        covariance = difference @ of_both @ difference.T
-        unit, share = _widths(size), float(second.double().mean())
-        known = torch.eye(_SIZE, dtype=torch.float64) + torch.linalg.pinv(covariance) * unit * unit[:, None]
-        mixed = -sum(part * math.log(part) for part in (share, 1.0 - share) if part > 0)
-        price = 0.5 * float(torch.logdet(known)) + 0.5 * math.log(len(second)) + len(second) * mixed
-        return cls(both, covariance, price)
+    both, of_both, _ = views.best(second)
+    sign = of_both.new_tensor([-1.0, 1.0])
+    covariance = torch.einsum("i,iajb,j->ab", sign, of_both.view(2, _SIZE, 2, _SIZE), sign)
+    unit, share = _widths(size), float(second.double().mean())
+    known = torch.eye(_SIZE, dtype=torch.float64) + torch.linalg.pinv(covariance) * unit * unit[:, None]
+    mixed = -sum(part * math.log(part) for part in (share, 1.0 - share) if part > 0)
+    return both, covariance, 0.5 * float(torch.logdet(known)) + 0.5 * math.log(len(second)) + len(second) * mixed
 
 
 def _grouped(views: _ByView, mean: Tensor, size: tuple[int, int]) -> Tensor:
@@ -506,7 +491,7 @@ def _grouped(views: _ByView, mean: Tensor, size: tuple[int, int]) -> Tensor:
         if torch.equal(moved, second):
             break
         second = moved
-    return second[views.fall(second).argmax()]
+    return second[views.best(second)[2].argmax()]
 
 
 def _two_cameras(refits: _Refits, views: _ByView, second: Tensor, nats: float) -> OwnLenses | None:
@@ -523,10 +508,11 @@ def _two_cameras(refits: _Refits, views: _ByView, second: Tensor, nats: float) -
             break
         second = moved
     second = second if 2 * int(second.sum()) <= len(second) else ~second
-    parted, fit = _Parted.of(views, second, refits.fit.size), refits.fit
-    change = parted.both[1] - parted.both[0]
+    fit = refits.fit
+    both, covariance, price = _parted(views, second, fit.size)
+    change = both[1] - both[0]
     unlikely = change / _widths(fit.size)
-    likelier = refits.nats(views) + float(views.fall(second) - 0.5 * unlikely.square().sum()) - parted.price
+    likelier = refits.nats(views) + float(views.best(second)[2] - 0.5 * unlikely.square().sum()) - price
     if likelier < nats + WORTH:
         return None
     by_group = views.by_group(second)
@@ -534,8 +520,8 @@ def _two_cameras(refits: _Refits, views: _ByView, second: Tensor, nats: float) -
         second=second,
         clear=0.5 * torch.where(second, -by_group, by_group),
         change=change,
-        sigma=parted.covariance.diagonal().sqrt(),
-        turned=_mirrored(change, parted.covariance, fit.state.parameters[2:4] + parted.both[0, 1:], fit),
+        sigma=covariance.diagonal().sqrt(),
+        turned=_mirrored(change, covariance, fit.state.parameters[2:4] + both[0, 1:], fit),
     )
     sigma = refits.theta.square().mean(0).sqrt()
     return OwnLenses(fit=refits.widened(sigma), sigma=sigma, theta=refits.theta, nats=likelier, groups=groups)
