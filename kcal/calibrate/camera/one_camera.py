@@ -32,11 +32,11 @@ from kcal.texts import number_text
 # A view's own scale and principal point, θ = (ln scale, cx, cy) off those of all views: of another camera or crop, of a
 # lens that focuses anew, or of one that a stabilizer moves.
 #
-# Poses, and motions during the readout, hide most of that: the RMS of one camera for all is hardly larger. So it is
-# told by the evidence. Near the solution each view is a quadratic form in θ, its pose and motion eliminated. θ is given
-# a normal prior, whose amplitudes have the largest evidence; views of one camera stay below zero nats. Where they do
-# not, corners are moved by what was found, the camera is fitted again to these, and so on. In the end two values of θ,
-# one for each of two groups of views, compete with the normal prior.
+# Poses, motions during the readout, and lens and board of all views hide most of that: the RMS of one camera for all is
+# hardly larger. So it is told by the evidence. Near the solution each view is a quadratic form in θ, its pose and
+# motion eliminated, lens and board free. Where the slopes by θ are steeper than noise makes them, θ is given a normal
+# prior, whose amplitudes have the largest evidence. Corners are moved by what was found, the camera is fitted again to
+# these, and so on. In the end two values of θ, one for each of two groups of views, compete with the normal prior.
 
 # fx, fy, cx, cy among the parameters.
 _INDICES = (0, 1, 2, 3)

@@ -214,11 +214,11 @@ class TestNotAccused:
 
 @pytest.mark.slow
 def test_a_phone_with_a_stabilizer(kcal_data: Path) -> None:
-    """Its halves agree within their error bars."""
+    """Its halves agree within their error bars: the ratio was 1.43 while lens and board hid a part of the movement."""
     seen = Observations.load(kcal_data / "captures" / "luisa39.obs.json")
     halves = [calibrate_camera(seen.subset(seen.names[part::2])) for part in (0, 1)]
     assert all(any("image stabilizer" in text for text in half.warnings) for half in halves)
-    assert camera_difference(halves[0].camera, halves[1].camera).same
+    assert camera_difference(halves[0].camera, halves[1].camera).ratio < 1.2
 
 
 def test_amplitudes_from_quadratic_forms() -> None:
