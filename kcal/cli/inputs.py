@@ -187,7 +187,10 @@ IMAGES = Wanted(
     (("observations", _CALIBRATE),),
 )
 VIDEO = dataclasses.replace(
-    IMAGES, words="a video", kinds=frozenset({"video", "bag", "device", "unknown", "foreign"}), make="kcal live --help"
+    IMAGES,
+    words="a video",
+    kinds=frozenset({"video", "bag", "device", "unknown", "foreign"}),
+    make="ffmpeg -framerate 10 -pattern_type glob -i 'left/*.png' -crf 18 left.mp4",
 )
 VIEWED = dataclasses.replace(
     OBSERVATIONS,

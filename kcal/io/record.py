@@ -256,8 +256,8 @@ class NetworkRecord(Record):
             found = NetworkModes(_built(self.layers), vector=self.features is None)
         else:
             raise InputError(
-                f"the field of this camera is a network of the class {self.kind}, which is not kcal's: give such a "
-                f"module when loading, as in load_camera(path, field={self.kind}())"
+                f"the field of this camera is a network of the class {self.kind}, which is not kcal's and no command "
+                f"can load: in Python, give such a module, as in load_camera(path, field={self.kind}())"
             )
         stored, own = self._state(), found.trunk.state_dict()
         shapes = [{name: tuple(value.shape) for name, value in each.items()} for each in (stored, own)]

@@ -130,7 +130,7 @@ class CalibrationRecord:
     tempering: float | None = None
     board_deviation: tuple[tuple[float, float, float], ...] | None = None
     temperature: float | None = None
-    without: tuple[Literal["motion", "bending"], ...] = ()
+    without: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     kcal_version: str
     created: datetime.datetime

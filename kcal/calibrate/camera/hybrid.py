@@ -180,7 +180,7 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
         status=status,
         iterations=fit.iterations,
         hybrid=fit,
-        without=options.without,
+        without=tuple(name for name in ("motion", "bending") if not getattr(options, name)),
         advice=what_to_photograph(observations, camera, fit.state.rotation),
         findings=(
             *general_findings([names[i] for i in used], camera, fit.rms, per_view[used], (), status, stated),

@@ -171,11 +171,6 @@ class CalibrationOptions:
         return self.camera is None and (named or bool(LensModel.named(self.model).hybrid))
 
     @property
-    def without(self) -> tuple[Literal["motion", "bending"], ...]:
-        """What is left out, as `CalibrationRecord` says it."""
-        return (*(("motion",) if not self.motion else ()), *(("bending",) if not self.bending else ()))
-
-    @property
     def modes(self) -> FieldModes | None:
         """Of the field; None: those of the default lens."""
         if self.field is not None:
@@ -348,7 +343,7 @@ class CameraCalibrationResult(ArrowRows):
     rejected_corners: tuple[Rejected, ...] = ()
     rejected_views: tuple[Rejected, ...] = ()
     by_view: Tensor | None = None
-    without: tuple[Literal["motion", "bending"], ...] = ()
+    without: tuple[str, ...] = ()
     shared_board: SharedBoard | None = None
 
     def __post_init__(self) -> None:

@@ -218,9 +218,8 @@ def stored_options(camera: Camera) -> CalibrationOptions:
     moved = record.board_deviation if record else None
     exact = moved is not None and not any(any(corner) for corner in moved)
     left = record.without if record else ()
-    return CalibrationOptions(
-        board="exact" if exact else "printed", reject=reject, motion="motion" not in left, bending="bending" not in left
-    )
+    motion, bending = (name not in left for name in ("motion", "bending"))
+    return CalibrationOptions(board="exact" if exact else "printed", reject=reject, motion=motion, bending=bending)
 
 
 def seen_pixels(result: CameraCalibrationResult) -> Tensor:
