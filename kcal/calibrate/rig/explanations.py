@@ -133,8 +133,8 @@ def survey_unit_findings(data: RigData, solution: RigSolution) -> list[Finding]:
     if apart <= _FAR_APART and far <= _FAR_LANDMARKS:
         return []
     cameras = f", and the cameras {length_text(apart)} apart" if apart else ""
-    text = f"landmarks are {length_text(far)} away (median){cameras}: is the survey in meters?"
-    return [Finding("units", "doubt", text, "convert the survey to meters, or measure the baseline too")]
+    text = f"landmarks are {length_text(far)} away (median){cameras}, as if the survey were not in meters"
+    return [Finding("units", "doubt", text, "convert it to meters; a measured baseline would settle it")]
 
 
 def cost_of_features_behind(problem: RigProblem, state: RigState) -> float:

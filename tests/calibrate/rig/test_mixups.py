@@ -120,7 +120,7 @@ class TestSwap:
         large = dataclasses.replace(survey, points=1e3 * survey.points, sigma=1e3 * survey.sigma)
         straight = RigOptions(refraction=0.0, refraction_sigma=0.0)
         asked = [
-            [text for text in solve_rig(data, straight).warnings if "is the survey in meters?" in text]
+            [text for text in solve_rig(data, straight).warnings if "as if the survey were not in meters" in text]
             for source in (survey, large)
             for data in [RigData(cameras=CAMERAS[:2], names=("left", "right"), landmarks=source)]
         ]
