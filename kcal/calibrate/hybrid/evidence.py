@@ -173,7 +173,8 @@ class Integrated(NamedTuple):
         # A row for each motion, times the covariance of lens and board.
         spread = matrix_product(reach.flatten(0, 1), covariance).view(reach.shape)
         kept = own.diagonal(dim1=1, dim2=2)
-        # Numbers of one amplitude count together: within a view, and across all views.
+        # Numbers of one amplitude count together: within a view, and across all views. What only the second derivatives
+        # need has the precision of a Newton step.
         number = torch.from_numpy(amplitudes_of(amplitudes))
         together = torch.nn.functional.one_hot(number, amplitudes).to(own.dtype).T
         G = spread @ reach.transpose(1, 2)
@@ -184,13 +185,13 @@ class Integrated(NamedTuple):
         along, mixed = (together @ (rows * mean[..., None]).sum(0) for rows in (reach, spread))
         if len(mean.flatten()) ** 2 < amplitudes * len(step) ** 2:
             # Few views have fewer rows than there are unknowns.
-            pairs = matrix_product(spread.flatten(0, 1), reach.flatten(0, 1).T).square()
+            pairs = matrix_product(spread.flatten(0, 1).float(), reach.flatten(0, 1).T.float()).square().double()
             across = together @ pairs.unflatten(0, mean.shape).unflatten(2, mean.shape).sum((0, 2)) @ together.T
         else:
             each = number.bincount().tolist()
-            parts = zip(spread.split(each, 1), reach.split(each, 1), strict=True)
+            parts = zip(spread.float().split(each, 1), reach.float().split(each, 1), strict=True)
             both = torch.stack([matrix_product(one.flatten(0, 1).T, other.flatten(0, 1)) for one, other in parts])
-            across = both.flatten(1) @ both.mT.flatten(1).T
+            across = (both.flatten(1) @ both.mT.flatten(1).T).double()
         second = 4.0 * (together @ within @ together.T - mixed @ along.T) - 2.0 * across
         Y, squared = torch.from_numpy(y), together @ spread.square().sum(0)
         by_noise = together @ mean.square().sum(0) + 2.0 * mixed @ Y + squared.sum(-1)
@@ -573,7 +574,8 @@ def evidence_of_corners(
 
 # Degrees of freedom of that distribution.
 _TAILS = 3.0
-_REPEATS = 30
+# Repeats at most, and the relative change of factors below which they end.
+_REPEATS, _SAME = 30, 1e-5
 
 
 def relative_bends(data: ViewData, best: Amplitudes, families: PriorFamilies) -> Tensor:
@@ -586,7 +588,9 @@ def relative_bends(data: ViewData, best: Amplitudes, families: PriorFamilies) ->
         inverse = torch.linalg.inv(data.own + torch.diag_embed(stillness(best.log_ratio, relative)))
         mean, spread = inverse @ left[..., None], inverse.diagonal(dim1=1, dim2=2)
         moment = (mean[..., 0].square() + best.variance * spread)[:, -BENDS:].sum(1) / square
-        relative = ((_TAILS + moment) / (_TAILS + BENDS)).sqrt()
+        before, relative = relative, ((_TAILS + moment) / (_TAILS + BENDS)).sqrt()
+        if float((relative / before - 1.0).abs().max()) < _SAME:
+            break
     return relative
 
 
