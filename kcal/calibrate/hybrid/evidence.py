@@ -173,8 +173,7 @@ class Integrated(NamedTuple):
         # A row for each motion, times the covariance of lens and board.
         spread = matrix_product(reach.flatten(0, 1), covariance).view(reach.shape)
         kept = own.diagonal(dim1=1, dim2=2)
-        # Numbers of one amplitude count together: within a view, and across all views. What only the second derivatives
-        # need has the precision of a Newton step.
+        # Numbers of one amplitude count together: within a view, and across all views (of single precision, for steps).
         number = torch.from_numpy(amplitudes_of(amplitudes))
         together = torch.nn.functional.one_hot(number, amplitudes).to(own.dtype).T
         G = spread @ reach.transpose(1, 2)
@@ -400,8 +399,8 @@ def maximize_evidence(
     bounds = hyper_bounds(prior, len(start.log_ratio), log_variance)
     if known_noise:
         bounds[-1] = log_variance, log_variance
-    loss = EvidenceLoss(data, families, prior, tempering)
-    at, value = _minimum(loss, start.vector, bounds, *(_ROUGHLY if rough else _EXACTLY))
+    loss, until = EvidenceLoss(data, families, prior, tempering), _ROUGHLY if rough else _EXACTLY
+    at, value = _minimum(loss, start.vector, bounds, *until)
     return Amplitudes(torch.from_numpy(at[:count].copy()), math.exp(at[-1]), at[count:-1].copy(), float(value))
 
 
@@ -574,8 +573,7 @@ def evidence_of_corners(
 
 # Degrees of freedom of that distribution.
 _TAILS = 3.0
-# Repeats at most, and the relative change of factors below which they end.
-_REPEATS, _SAME = 30, 1e-5
+_REPEATS = 30
 
 
 def relative_bends(data: ViewData, best: Amplitudes, families: PriorFamilies) -> Tensor:
@@ -589,7 +587,7 @@ def relative_bends(data: ViewData, best: Amplitudes, families: PriorFamilies) ->
         mean, spread = inverse @ left[..., None], inverse.diagonal(dim1=1, dim2=2)
         moment = (mean[..., 0].square() + best.variance * spread)[:, -BENDS:].sum(1) / square
         before, relative = relative, ((_TAILS + moment) / (_TAILS + BENDS)).sqrt()
-        if float((relative / before - 1.0).abs().max()) < _SAME:
+        if torch.allclose(relative, before, rtol=1e-5, atol=0.0):
             break
     return relative
 
@@ -634,13 +632,8 @@ def expected_maximum(
     value, _, bend = loss(at)
     if not math.isfinite(value):
         raise ArithmeticError("the views contradict each other so far that the evidence of their lens is no number")
-    found = expected_amplitudes(
-        bend,
-        loss.value,
-        at,
-        which,
-        hyper_bounds(hyperprior, len(best.log_ratio), log_variance),
-    )
+    bounds = hyper_bounds(hyperprior, len(best.log_ratio), log_variance)
+    found = expected_amplitudes(bend, loss.value, at, which, bounds)
     return best._replace(h=torch.from_numpy(found[:count].copy()), log_ratio=found[count:-1].copy())
 
 
