@@ -181,18 +181,21 @@ class Integrated(NamedTuple):
         first = together @ ((1.0 - kept) / tempering - moment).sum(0)
         within = (-0.5 * own.square() / tempering - own * (mean[:, :, None] * mean[:, None]) - own * G).sum(0)
         within.diagonal().add_((0.5 * kept / tempering + 0.5 * moment).sum(0))
-        along, mixed = (together @ (rows * mean[..., None]).sum(0) for rows in (reach, spread))
+        along = (together[:, None] * mean).flatten(1) @ reach.flatten(0, 1)
+        mixed = along @ covariance
         if len(mean.flatten()) ** 2 < amplitudes * len(step) ** 2:
             # Few views have fewer rows than there are unknowns.
             pairs = matrix_product(spread.flatten(0, 1).float(), reach.flatten(0, 1).T.float()).square().double()
             across = together @ pairs.unflatten(0, mean.shape).unflatten(2, mean.shape).sum((0, 2)) @ together.T
+            squared = together @ spread.square().sum(0)
         else:
             each = number.bincount().tolist()
             parts = zip(spread.float().split(each, 1), reach.float().split(each, 1), strict=True)
             both = torch.stack([matrix_product(one.flatten(0, 1).T, other.flatten(0, 1)) for one, other in parts])
             across = (both.flatten(1) @ both.mT.flatten(1).T).double()
+            squared = (both.double() * covariance).sum(2)
         second = 4.0 * (together @ within @ together.T - mixed @ along.T) - 2.0 * across
-        Y, squared = torch.from_numpy(y), together @ spread.square().sum(0)
+        Y = torch.from_numpy(y)
         by_noise = together @ mean.square().sum(0) + 2.0 * mixed @ Y + squared.sum(-1)
         return Slopes(first.numpy(), second.numpy(), -(2.0 * mixed * Y + squared).numpy(), by_noise.numpy())
 
