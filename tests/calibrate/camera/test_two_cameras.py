@@ -252,5 +252,6 @@ def test_amplitudes_from_quadratic_forms() -> None:
     second = torch.arange(count) < 15
     parted = views_of(torch.where(second[:, None], 40.0 * theta.new_tensor([0.0, 1.0, -1.0]), 0.0))
     first, other = parted.best(second)[0]
+    torch.testing.assert_close(first, -other)  # what is common is the camera's
     torch.testing.assert_close((other - first)[1:], theta.new_tensor([40.0, -40.0]), rtol=0.1, atol=0.0)
     assert int(((parted.by_group(second) < 0.0) != second).sum()) < 0.1 * count
