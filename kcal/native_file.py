@@ -43,7 +43,8 @@ class Record(pydantic.BaseModel):
     """Base of the blocks inside kcal's files: unknown fields, NaN and infinity are refused.
 
     `_LATER`: fields that a version of the format got after files of it had been written, with the value that stands for
-    "not said". A field that has this value is left out, so that an older kcal reads the file.
+    "not said"; in "calibration.without", within a field. A field that has this value is left out, so that an older kcal
+    reads the file.
     """
 
     __repr__ = brief
@@ -71,15 +72,13 @@ class Record(pydantic.BaseModel):
     # No type for what it returns: in JSON schemas, pydantic would put that type in place of the fields.
     @pydantic.model_serializer(mode="wrap")
     def _as_before(self, plain: pydantic.SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def]
-        later = self._LATER
-        return {key: value for key, value in plain(self).items() if key not in later or value != later[key]}
-
-
-def without_unsaid(content: dict[str, Any] | None, name: str) -> dict[str, Any] | None:
-    """The block without this field where it says nothing, as for `Record._LATER`; changed in place."""
-    if content is not None and not content[name]:
-        del content[name]
-    return content
+        content = plain(self)
+        for later, unsaid in self._LATER.items():
+            *outer, name = later.split(".")
+            block = functools.reduce(lambda found, key: found and found[key], outer, content)
+            if block and (block[name] or unsaid) == unsaid:
+                del block[name]
+        return content
 
 
 def _underived(content: Any, places: Iterable[tuple[int | str, ...]]) -> Any:

@@ -25,7 +25,7 @@ from kcal.io.record import CovarianceRecord, InformationRecord, LensOrders
 from kcal.lens.calibration import CalibrationRecord, CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
 from kcal.lens.projection import INTRINSICS
-from kcal.native_file import NativeFile, Record, storing, without_unsaid
+from kcal.native_file import NativeFile, Record, storing
 
 
 class IntrinsicsRecord(Record):
@@ -88,7 +88,7 @@ class CameraFile(NativeFile):
 
     KIND: ClassVar[str] = "camera"
     VERSION: ClassVar[int] = 2
-    _LATER: ClassVar[Mapping[str, Any]] = {"setting": None}
+    _LATER: ClassVar[Mapping[str, Any]] = {"setting": None, "calibration.without": ()}
 
     name: str
     image_size: ImageSize
@@ -136,9 +136,9 @@ class CameraFile(NativeFile):
         return self
 
     @pydantic.field_serializer("calibration", mode="wrap")
-    def _as_needed(self, value: CalibrationRecord | None, plain: pydantic.SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def]
-        """Leave out what is not needed, so that an older kcal reads the file."""
-        content = without_unsaid(plain(value), "without")
+    def _board_as_before(self, value: CalibrationRecord | None, plain: pydantic.SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def]
+        """Leave out fields that checkerboards do not need, so that their files stay as they were."""
+        content = plain(value)
         if content is not None and content["board"]["pattern"] == "checkerboard":
             del content["board"]["pattern"], content["board"]["gap"]
         return content

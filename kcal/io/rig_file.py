@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -27,7 +28,7 @@ from kcal.lens.calibration import RigCalibration
 from kcal.lens.pair_errors import relative_root
 from kcal.lens.projection import INTRINSICS
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting, Origin, Rig
-from kcal.native_file import NativeFile, Record, storing, without_unsaid
+from kcal.native_file import NativeFile, Record, storing
 
 Triple = tuple[float, float, float]
 
@@ -124,6 +125,7 @@ class RigFile(NativeFile):
 
     KIND: ClassVar[str] = "rig"
     VERSION: ClassVar[int] = 4
+    _LATER: ClassVar[Mapping[str, Any]] = {"calibration.lens_change": 0.0}
 
     names: tuple[str, ...]
     cameras: tuple[CameraFile, ...]
@@ -153,11 +155,6 @@ class RigFile(NativeFile):
         if (len(self.names) != 2 or self.origin is not None) and all(file.model.complete for file in self.cameras):
             self.rig()
         return self
-
-    @pydantic.field_serializer("calibration", mode="wrap")
-    def _as_needed(self, value: RigCalibration | None, plain: pydantic.SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def]
-        """Leave out what is not needed, so that an older kcal reads the file."""
-        return without_unsaid(plain(value), "lens_change")
 
     @classmethod
     def parse(cls, content: Any, source: str) -> Self:
