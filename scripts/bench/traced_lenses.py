@@ -140,21 +140,7 @@ def traced(
         f"Hybrid over the best of the others in each cell: {'; '.join(means)}. Cells with {SHOWN:g} px of noise:",
         "",
         *table(["board", "lens", "views", *MODELS, "ratio"], rows),
-        "",
-        *coverage_table(records),
     ]
-
-
-def coverage_table(records: list[Record]) -> list[str]:
-    """How often the truth is inside the hybrid's ellipses."""
-    rows = []
-    for board, name in itertools.product(BOARDS, LENSES):
-        own = [r for r in records if (r["board"], r["lens"], r["model"]) == (board, name, "hybrid") and "inside" in r]
-        if own:
-            rows.append([board, name, *(between_seeds(own, key) for key in ("inside", "beyond")), len(own)])
-    header = ["board", "lens", "where boards reached", "beyond", "captures"]
-    seeds = ", ".join(map(str, sorted({r["seed"] for r in records})))
-    return [f"Truth inside the 95 % ellipses of the hybrid, seeds {seeds}:", "", *table(header, rows)]
 
 
 def between_seeds(records: list[Record], key: str) -> str:
@@ -174,7 +160,10 @@ def sigmas(
     views: tuple[int, ...] = (60, 30), noise: tuple[float, ...] = (0.03, 0.1, 0.2),
     boards: tuple[str, ...] = BOARDS, apart: bool = False,
 ) -> list[str]:  # fmt: skip
-    """Predicted errors of the hybrid over true ones, and its coverage; `apart`: each noise has views of its own."""
+    """Predicted errors of the hybrid over true ones, and how often the truth is inside its ellipses.
+
+    With `apart` each noise has views of its own.
+    """
     records = fits_of(kept, seeds, lenses, views, noise, boards, ("hybrid",), apart)
     cells: dict[tuple[Any, ...], list[Record]] = {}
     for r in records:
@@ -185,9 +174,16 @@ def sigmas(
         predicted, true = (math.sqrt(statistics.fmean(r[key] ** 2 for r in own)) for key in ("predicted", "rms"))
         ratios.append(predicted / true)
     mean = math.exp(statistics.fmean(map(math.log, ratios)))
+    rows, known = list[list[Any]](), [r for r in records if "inside" in r]
+    for key in itertools.product(BOARDS, LENSES, VIEWS):
+        own = [r for r in known if (r["board"], r["lens"], r["views"]) == key]
+        if own:
+            rows.append([*key, *(between_seeds(own, what) for what in ("inside", "beyond")), len(own)])
     return [
         f"Predicted over true RMS error at infinity: geometric mean {mean:.2f}, from {min(ratios):.2f} to "
         f"{max(ratios):.2f}, each from {len(next(iter(cells.values())))} captures.",
         "",
-        *coverage_table(records),
+        f"Truth inside the 95 % ellipses of the hybrid, seeds {', '.join(map(str, seeds))}:",
+        "",
+        *table(["board", "lens", "views", "where boards reached", "beyond", "captures"], rows),
     ]
