@@ -340,6 +340,7 @@ def test_the_noise_of_marks_is_that_of_the_rig(folder: Path) -> None:
     assert stated.stdout == kcal("locate", "rig.json", "points.csv", "--pixel-sigma", "0.1").stdout
     assert stated.stdout != kcal("locate", "rig.json", "points.csv", "--pixel-sigma", "0.3").stdout
     assert "noise of marks: 0.3 px, assumed; --pixel-sigma states it" in kcal("budget").stderr
+    assert "noise of marks: 0.1 px, from the rig's file" in kcal("budget", "rig.json").stderr
     assert "noise of marks 0.1 px along each axis" in kcal("show", "rig.json").stdout
 
 

@@ -225,6 +225,22 @@ def test_batch_of_starts_is_one_by_one() -> None:
         torch.testing.assert_close(together.state[0][i], alone.state[0], rtol=0, atol=1e-8)
 
 
+class Pulled(Planes):
+    """The same with a prior of unit weight on the shared unknowns."""
+
+    def shared_gram(self, state: State) -> Tensor:
+        rows = torch.cat([torch.eye(2, dtype=torch.float64), state[0][:, None]], 1)
+        return rows.T @ rows
+
+
+def test_the_cost_of_priors_is_half_their_squares() -> None:
+    x, y = curves()
+    state = (torch.tensor([3.0, 4.0]).double(), torch.zeros(6, 2).double())
+    assert float(Pulled(y, x).cost(state) - Planes(y, x).cost(state)) == pytest.approx(12.5)
+    free, pulled = (minimize(kind(y, x), state).state[0].norm() for kind in (Planes, Pulled))
+    assert float(pulled) < float(free)
+
+
 # Items that are eliminated before a system is damped: the same solution, and what their own unknowns do after.
 
 
