@@ -32,6 +32,7 @@ KINDS = {
     "copies": ("copies of views", "", "lenses"), "repeated": ("poses that repeat", "poses", "lenses"),
     "moving-lens": ("lens that moves", "", "lenses"), "alone": ("calibrated alone", "", "lenses"),
     "stars": ("boards and stars", "", "lenses"), "unit": ("size of the board", "", FAULTS),
+    "units": ("unit of the survey", "rig", FAULTS),
     "error-bars": ("error bars", "", ""), "view": ("common view", "", ""),
     "misfit": ("size of residuals", "rig", "relative pose"), "record": ("no record", "", "relative pose"),
     "synchronization": ("same moment", "rig", "relative pose"), "exact-lenses": ("exact lenses", "", "lenses"),

@@ -415,11 +415,11 @@ for name in {}:
     ("line", "libraries"),
     [
         ("board --board charuco:9x6 --square 25mm -o board.svg", "cv2"),
-        ("diff left.json left.json", "kornia torch"),
+        ("diff left.json left.json", "torch"),
         ("export plain.json -o plain.yaml", "cv2 torch"),
         (f"report {SAMPLE}", "torch"),
         (f"locate {SAMPLE} {SAMPLE.with_name('sample-points.csv')}", "pyproj torch"),
-        ("budget", "kornia torch"),
+        ("budget", "torch"),
     ],
 )
 def test_a_command_loads_what_it_computes_with_and_no_more(line: str, libraries: str, start_folder: Path) -> None:
