@@ -302,7 +302,7 @@ def _damped_newton(
         lens = distort_components(x, y, coefficients, model)
         a, b, d, e = lens.point
         determinant = lens.determinant
-        regular = lens.positive & (determinant > 0) & in_region(x, y, coefficients, model, region)
+        regular = lens.positive & (determinant > 0) & in_region(x, y, coefficients, model, region, lens)
         inverse = torch.where(regular, determinant.reciprocal(), 0.0)
         error_x, error_y = lens.x - target_x, lens.y - target_y
         error = torch.where(regular, error_x * error_x + error_y * error_y, torch.inf)
