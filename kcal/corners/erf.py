@@ -80,14 +80,15 @@ def center_covariance(
     moving, white = gain[:, :, :2], outer[..., :2, :2]
     odd, pair = _odd(residual, weight, center)
     # (1 - J G)(1 - J G)ᵀ beside the 1 is J at one pixel times `smeared - gain` at the other, less G times J.
-    ahead, behind = torch.cat([jacobian, -gain], 2), torch.cat([smeared - gain, jacobian], 2)
+    weights = pair[:, :, None]
+    ahead, behind = torch.cat([jacobian, -gain], 2) * weights, torch.cat([smeared - gain, jacobian], 2) * weights
+    odd = pair * odd
 
     def found_and_made(down: int, right: int) -> tuple[Tensor, Tensor, Tensor]:
         """Weighted sums over pairs of pixels: products found, products that fitting makes of white noise, and pairs."""
         here, there = _pixel_pairs(down, right)
-        both = pair[here] * pair[there]
-        made = 2.0 * (both * (ahead[here] * behind[there]).sum(-3))  # twice: all of it is odd
-        return (both * odd[here] * odd[there]).sum((-2, -1)), made.sum((-2, -1)), both.sum((-2, -1))
+        made = 2.0 * (ahead[here] * behind[there]).sum((-3, -2, -1))  # twice: all of it is odd
+        return (odd[here] * odd[there]).sum((-2, -1)), made, (pair[here] * pair[there]).sum((-2, -1))
 
     found, made, count = found_and_made(0, 0)
     freedom = (count + made).clamp_min(1.0)
@@ -337,7 +338,7 @@ def _start(window: CornerWindow) -> tuple[Tensor, Tensor]:
     parameters[:, 2], parameters[:, 3] = axis - opening, axis + opening
     parameters[:, 4] = (0.2 * window.radius).clamp(0.6, 1.5).log()
     parameters[:, 6] = 1.0
-    levels, _ = crossing(parameters, window.where, torch.zeros_like(parameters[:, :2]))
+    levels, _ = crossing(parameters, window.where, torch.zeros_like(parameters[:, :2]), slopes=False)
     design = torch.stack([one, levels], -1)
     parameters[:, 5:7] = _least_squares(design, window.levels, weight)
     return parameters, crosses

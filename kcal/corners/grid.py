@@ -377,8 +377,8 @@ def step_along(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, do
 def levels_beside(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
     """Gray levels after and before each of `places` (..., 2), on the side of `down`; (2, ...)."""
     share = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)[:, None]
-    places, along, down = places[..., None, :], along[..., None, :], down[..., None, :]
-    return torch.stack([levels_at(image, places + share * (sign * along + down)).mean(-1) for sign in (1.0, -1.0)])
+    ways = torch.stack([down + along, down - along])[..., None, :]
+    return levels_at(image, places[..., None, :] + share * ways).mean(-1)
 
 
 def skips(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
@@ -401,7 +401,8 @@ def _skips_rows(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
 
 def contrast(image: npt.NDArray[np.generic], places: Tensor, along: Tensor, down: Tensor) -> Tensor:
     """Twice how much lighter two opposite quadrants around places (..., 2) are than the other two."""
-    return step_along(image, places, along, down) - step_along(image, places, along, -down)
+    ahead, back = step_along(image, places, along, torch.stack([down, -down]))
+    return ahead - back
 
 
 def _four_meet(image: npt.NDArray[np.generic], grid: Tensor) -> bool:
