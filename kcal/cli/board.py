@@ -16,6 +16,7 @@ from kcal.cli.inputs import typed, typed_with
 from kcal.cli.options import Kind
 from kcal.errors import InputError, KcalError
 from kcal.files import check_writable, is_stream, make_folder, source_name, write_atomic
+from kcal.texts import counted_text
 
 
 def board_print_command(
@@ -234,7 +235,7 @@ def detect_command(
     print_left_out(
         [f"failed {failure.name}: {failure.reason}" for failure in failures],
         output,
-        f"{len(failures)} images failed",
+        f"{counted_text(len(failures), 'image')} failed",
     )
     if not pattern.unambiguous:
         out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")

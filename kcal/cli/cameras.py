@@ -18,7 +18,7 @@ from kcal.cli.options import Kind, Several
 from kcal.errors import InputError
 from kcal.files import check_writable, write_atomic
 from kcal.table import Columns, Table
-from kcal.texts import number_text
+from kcal.texts import counted_text, number_text
 
 # `kcal export` and `kcal import`: cameras for other programs, and from them.
 
@@ -152,7 +152,7 @@ def import_command(
         seen.save(output)
         weights = "with weights" if seen.covariances() is not None else "without weights"
         corners = sum(int(view.seen.sum()) for view in seen.views)
-        out.print(f"{len(seen.views)} views with {corners} corners, {weights}")
+        out.print(f"{counted_text(len(seen.views), 'view')} with {corners} corners, {weights}")
     elif what:
         _import_survey(paths[0], output, survey_sigma, geoid)
     else:

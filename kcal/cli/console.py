@@ -61,6 +61,20 @@ def print_label(label: str, text: str, style: str = "yellow") -> None:
     print_styled(f"{label}: {text}", f"^{label}:", style, to=err)
 
 
+# What ends a command with one line and exit code 1.
+ERRORS = (KcalError, OSError, MemoryError)
+
+
+def error_text(error: BaseException) -> str:
+    """The line that tells a person and a program why a command failed."""
+    if isinstance(error, MemoryError):
+        return "not enough memory; use fewer or smaller inputs"
+    if isinstance(error, OSError) and not isinstance(error, KcalError):
+        # What no command foresaw of files and folders: a disk that was taken away, a folder that may not be listed.
+        return f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}"
+    return " ".join(str(error).split())
+
+
 # What the running command tells programs, if it was asked to.
 _told: dict[str, Any] = {}
 _as_json = False

@@ -23,7 +23,7 @@ from kcal.cli.options import Kind, Only, Rare, taken
 from kcal.cli.rig import DRIFTED, print_turns, replace_rig
 from kcal.errors import InputError, with_extra
 from kcal.files import check_writable
-from kcal.texts import measured_text
+from kcal.texts import counted_text, measured_text
 
 # `kcal live`: detections of two cameras or more to tracks on the map, as they come.
 
@@ -143,7 +143,7 @@ def live_command(
             err.print(f"live map: {page.address}")
         stream.shown = _progress(advance, stream, page)
         if stream.ledger.place.sequence:
-            err.print(f"continuing after {stream.ledger.place.sequence:,} moments of {log}")
+            err.print(f"continuing after {counted_text(stream.ledger.place.sequence, 'moment')} of {log}")
         ending = "finished"
 
         def stop(*_: object) -> None:
@@ -165,7 +165,7 @@ def live_command(
     if counts.jumps:
         ahead = "ahead" if counts.last_jump_s > 0 else "back"
         err.print(
-            f"times jumped {counts.jumps:,} times and stayed: followed, with new tracks; the last jump was "
+            f"times jumped ({counts.jumps:,} x) and stayed: followed, with new tracks; the last jump was "
             f"{abs(counts.last_jump_s):,.1f} s {ahead}"
         )
     if frames is not None:
@@ -184,16 +184,16 @@ def live_command(
 
 def summary(counts: rooms.StreamCounts) -> str:
     """What happened, in one line."""
-    parts = [f"{counts.moments:,} moments, {counts.positions:,} positions"]
-    for count, what in (
-        (counts.repeated, "moments not after the last one, skipped"),
-        (counts.contradicted, "moments left out, whose times the ones before and after contradict"),
-        (counts.waiting, "moments left for the next run, because no later one bears out how far their times jumped"),
-        (counts.malformed, "malformed lines"),
-        (counts.dropped, "moments dropped for lack of time"),
-        (counts.unsent, "moments that a receiver did not get"),
+    parts = [f"{counted_text(counts.moments, 'moment')}, {counted_text(counts.positions, 'position')}"]
+    for count, what, more in (
+        (counts.repeated, "moment", " not after the last one, skipped"),
+        (counts.contradicted, "moment", " left out, whose times the ones before and after contradict"),
+        (counts.waiting, "moment", " left for the next run, because no later one bears out how far their times jumped"),
+        (counts.malformed, "malformed line", ""),
+        (counts.dropped, "moment", " dropped for lack of time"),
+        (counts.unsent, "moment", " that a receiver did not get"),
     ):
-        parts += [f"{count:,} {what}"] if count else []
+        parts += [counted_text(count, what) + more] if count else []
     return "; ".join(parts)
 
 
@@ -227,7 +227,7 @@ def _progress(
             page.show(columns, stream.counts.moments, tracks.time)
         if clocks.monotonic() >= next_time:
             next_time, before, read = clocks.monotonic() + 0.5, read, stream.ledger.place.offset
-            advance(f"{len(tracks.number)} tracks; {summary(stream.counts)}", read - before)
+            advance(f"{counted_text(len(tracks.number), 'track')}; {summary(stream.counts)}", read - before)
 
     return show
 

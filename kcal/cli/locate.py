@@ -17,7 +17,7 @@ from kcal.cli.inputs import pixel_sigma_and_source
 from kcal.cli.options import Kind, Rare, settings_file, taken
 from kcal.errors import DegenerateError, InputError
 from kcal.files import written_files
-from kcal.texts import one_line
+from kcal.texts import counted_text, one_line
 
 # Positions; whether the table states noise; how far it is read.
 LocatedPart: TypeAlias = "tuple[rooms.PositionColumns, bool, int]"
@@ -28,7 +28,8 @@ LocatedPart: TypeAlias = "tuple[rooms.PositionColumns, bool, int]"
 
 def counts_text(rows: int, statuses: dict[str, int]) -> str:
     """How many rows have each status."""
-    return f"{rows:,} rows: " + ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in statuses.items())
+    counts = (f"{count:,} {name.replace('_', ' ')}" for name, count in statuses.items())
+    return f"{counted_text(rows, 'row')}: {', '.join(counts)}"
 
 
 def _print_positions(

@@ -15,9 +15,9 @@ from typer.core import TyperGroup
 
 import kcal
 from kcal.cli import inputs
-from kcal.cli.console import err, print_label, print_replaced, warn, working
+from kcal.cli.console import ERRORS, err, error_text, print_label, print_replaced, warn, working
 from kcal.cli.options import Command, declared, defaults_of, group_with_default, read_settings
-from kcal.errors import KcalError, KcalWarning
+from kcal.errors import KcalWarning
 from kcal.files import written_files
 from kcal.interrupts import only_interruptions
 from kcal.texts import visible
@@ -128,12 +128,6 @@ def main() -> None:
     )
     try:
         sys.exit(app())
-    except KcalError as error:
-        text = " ".join(str(error).split())
-    except OSError as error:
-        # What no command foresaw of files and folders: a disk that was taken away, a folder that may not be listed.
-        text = f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}"
-    except MemoryError:
-        text = "not enough memory; use fewer or smaller inputs"
-    print_label("error", text, "bold red")
-    sys.exit(1)
+    except ERRORS as error:
+        print_label("error", error_text(error), "bold red")
+        sys.exit(1)

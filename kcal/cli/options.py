@@ -33,7 +33,7 @@ from typer.core import TyperCommand, TyperGroup
 from kcal import values
 from kcal.cli import console
 from kcal.cli.inputs import Wanted, check_given, given_files, given_texts
-from kcal.errors import FileError, InputError, KcalError
+from kcal.errors import FileError, InputError
 from kcal.files import check_writable, is_stream, read_bytes, write_atomic
 
 # Settings of a folder: `kcal.toml` gives options of the commands that are run there or below.
@@ -341,8 +341,8 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
     Args:
         function: a command, see above.
         json: whether it has an option `--json`: one JSON object on the standard output, in place of what it prints.
-            It has `exit_code`, what the command tells (`console.tell`), and the lines that a person would read as
-            `text`. Errors go to the error stream, and the exit code is the same, with it and without.
+            It has `exit_code`, what the command tells (`console.tell`), the lines that a person would read as `text`,
+            and `error` if the command failed. The error stream and the exit code are the same, with it and without.
     """
     signature = inspect.signature(function, eval_str=True)
     text, about = described(function.__doc__)
@@ -351,9 +351,7 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
     names = [name for name in signature.parameters if name in {one.group for one in options}]
     groups = {name: _taken_apart(signature.parameters[name].annotation)[0] for name in names}
 
-    @functools.wraps(function)
-    def run(*, as_json: bool = False, **given: Any) -> None:
-        console.tell_anew(as_json)
+    def work(given: dict[str, Any]) -> None:
         others = [path for one in options if not one.kind.writes for path in given_files(given[one.name])]
         for path in (path for one in options if one.kind.writes for path in given_texts(given[one.name])):
             if path != "-":
@@ -369,18 +367,24 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
         own = read[None] | {name: cls(**read[name]) for name, cls in groups.items()}
         bound = signature.bind_partial()
         bound.arguments.update({name: own[name] for name in signature.parameters})
+        function(*bound.args, **bound.kwargs)
+
+    @functools.wraps(function)
+    def run(*, as_json: bool = False, **given: Any) -> None:
+        console.tell_anew(as_json)
         if not as_json:
-            return function(*bound.args, **bound.kwargs)
+            return work(given)
         ended: Exception = typer.Exit(0)
         with console.out.capture() as captured:
             try:
-                function(*bound.args, **bound.kwargs)
-            except (typer.Exit, KcalError) as stopped:
+                work(given)
+            except (typer.Exit, *console.ERRORS) as stopped:
                 ended = stopped
-        if isinstance(ended, typer.Exit) or console.told():
-            told = {"exit_code": getattr(ended, "exit_code", 1), **console.told(), "text": captured.get().splitlines()}
-            console.end_line()
-            print(orjson.dumps(told).decode())
+        told = {"exit_code": getattr(ended, "exit_code", 1), **console.told(), "text": captured.get().splitlines()}
+        if not isinstance(ended, typer.Exit):
+            told["error"] = console.error_text(ended)
+        console.end_line()
+        print(orjson.dumps(told).decode())
         raise ended
 
     parameters = [one.parameter for one in options]

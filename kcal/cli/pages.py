@@ -15,6 +15,7 @@ from kcal.cli.console import err, out, show_page, warn
 from kcal.cli.inputs import IMAGES, pixel_sigma_of
 from kcal.cli.options import Kind
 from kcal.errors import InputError, KcalError
+from kcal.texts import counted_text
 
 _MARK_PORT, _CAPTURE_PORT = 8347, 8348
 
@@ -87,7 +88,7 @@ def mark_command(
         server = rooms.LocalServer(lambda token, hosts: page(desk, token, hosts), port, fallback=port == _MARK_PORT)
         show_page(server.address, "marking page", browser=browser)
         if session.version:
-            err.print(f"continued after {session.version} actions in {session.files.log}")
+            err.print(f"continued after {counted_text(session.version, 'action')} in {session.files.log}")
         warn(*session.notes, *filter(None, [session.trouble]))
         server.run()
     finally:
@@ -142,7 +143,7 @@ def capture_command(
     pattern = pattern or board_in_images([source], square)
     session = rooms.CaptureSession(output, pattern, rooms.CaptureOptions(until=until, most=most, refine=refine))
     if session.views:
-        err.print(f"{output} has {session.views} views; going on")
+        err.print(f"{output} has {counted_text(session.views, 'view')}; going on")
     stop = threading.Event()
     failed: list[KcalError] = []
 
@@ -190,7 +191,7 @@ def capture_command(
         out.print(session.finished)
     elif session.views:
         known = f"; points at infinity are known to ± {session.sigma:.3f} px" if session.history else ""
-        out.print(f"{session.views} views kept{known}")
+        out.print(f"{counted_text(session.views, 'view')} kept{known}")
     if not session.views:
         raise InputError(f"no frame showed the board: {session.message}")
     out.print(f"wrote {output} and {session.views} frames in {session.frames}")

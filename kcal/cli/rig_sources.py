@@ -18,7 +18,7 @@ from kcal.cli.inputs import pixel_sigma_and_source, typed_with
 from kcal.cli.options import Kind, Rare, Several
 from kcal.cli.stars import Night
 from kcal.errors import ContradictionError, DegenerateError, InputError, KcalError
-from kcal.texts import measured_text
+from kcal.texts import counted_text, measured_text
 from kcal.values import WithSigma, named, with_sigma
 
 # What `kcal rig` and `kcal station` solve from, as options.
@@ -194,7 +194,7 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     ]
     read.notes += aligned(rows)
     if alone := sum(len(rooms.expand_images(one)) for one in given) - 2 * len(chosen):
-        read.notes.append(f"{alone} images of the scene without partner")
+        read.notes.append(f"{counted_text(alone, 'image')} of the scene without partner")
     if len(pairs) == 1:
         read.notes.append("one pair: what moves cannot be told from what stands still; give pairs of several times")
     read.add("features", features)
@@ -234,8 +234,8 @@ def _add_stars(read: RigReading, words: Sequence[str]) -> None:
     named = int(source.named.sum())
     read.sources |= {"stars": source, "positions": positions}
     read.notes += [
-        f"stars: {len(moments)} moments, {len(source.names)} stars, {named} with a direction on the Earth"
-        + (f"; {alone} images without partner" if alone else ""),
+        f"stars: {counted_text(len(moments), 'moment')}, {len(source.names)} stars, {named} with a known direction"
+        + (f"; {counted_text(alone, 'image')} without partner" if alone else ""),
         f"clocks of the cameras against each other: ± {night.clock_sigma:g} s, which no residual shows: up to "
         f"{math.degrees(7.292e-5 * night.clock_sigma):.5f}° of relative attitude, and part of every σ below",
     ]

@@ -23,7 +23,7 @@ from kcal.report.rig import rig_figure
 from kcal.report.shown import camera_blocks, derived_camera, observations_blocks, rig_blocks
 from kcal.report.tables import position_rows
 from kcal.report.verdict import Verdict
-from kcal.texts import page_text
+from kcal.texts import page_text, without_numbers
 
 # Positions that a notebook shows one by one.
 _MOST = 40
@@ -44,12 +44,14 @@ def html_of(record: object) -> str | None:
 
 @html_of.register
 def _camera_html(camera: Camera) -> str | None:
-    return None if camera.params.ndim > 1 else _html_of_blocks(camera_blocks(*derived_camera(camera)))
+    if camera.params.ndim > 1 or without_numbers(camera):
+        return None
+    return _html_of_blocks(camera_blocks(*derived_camera(camera)))
 
 
 @html_of.register
-def _rig(rig: Rig) -> str:
-    return _html_of_blocks(rig_blocks(rig))
+def _rig(rig: Rig) -> str | None:
+    return None if without_numbers(rig) else _html_of_blocks(rig_blocks(rig))
 
 
 @html_of.register

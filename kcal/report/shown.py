@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from kcal.texts import length_text, measured_text, number_text, setting_text
+from kcal.texts import counted_text, length_text, measured_text, number_text, setting_text
 
 if TYPE_CHECKING:
     from kcal.corners.observations import Observations
@@ -121,7 +121,7 @@ def pose_blocks(content: Mapping[str, Any], known: RigSummary) -> Blocks:
             f"at {place['lat']:.7f}, {place['lon']:.7f}, {place['height']:.2f} m, heading {place['heading_deg']:.3f}°"
         )
     if record := content["calibration"]:
-        yield f"solved {_when(record)}: RMS {record['rms']:.4f} px, {record['pairs']} pairs"
+        yield f"solved {_when(record)}: RMS {record['rms']:.4f} px, {counted_text(record['pairs'], 'pair')}"
         if record.get("pixel_sigma") is not None:
             yield f"noise of marks {record['pixel_sigma']:g} px along each axis"
         if record.get("lens_change"):
@@ -145,7 +145,8 @@ def observations_blocks(seen: Observations) -> Blocks:
     counts = [int(view.seen.sum()) for view in seen.views]
     width, height = seen.image_size
     yield f"board {seen.board}; images {width}x{height} px; refinement {seen.refinement}"
-    yield f"{len(counts)} views with {sum(counts)} corners, {len(seen.failures)} images without"
+    without = counted_text(len(seen.failures), "image")
+    yield f"{counted_text(len(counts), 'view')} with {sum(counts)} corners, {without} without"
     weights = "with" if all(view.covariance is not None for view in seen.views) else "without"
     yield f"corners {weights} their own covariances"
     yield from (f"  {failure.name}: {failure.reason}" for failure in seen.failures)

@@ -34,6 +34,7 @@ from kcal.cli.options import SETTINGS, defaults_of, read_settings, toml_text
 from kcal.errors import FileError
 from kcal.files import read_bytes, replaced, write_atomic, written_files
 from kcal.io.rig_file import save_rig
+from kcal.texts import visible
 from scripts.bench.startup import helps, measure, on_terminal
 
 # What reaches the terminal is shown and does nothing else; errors are one line.
@@ -69,6 +70,13 @@ def test_an_error_shows_the_name_of_a_file_as_it_is(
     assert shown.startswith("error: ")
     assert "not a kcal file" in shown
     assert "\x1b" not in shown
+    # A program reads it on the standard output.
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--json"])
+    with pytest.raises(SystemExit):
+        main()
+    told, again = capsys.readouterr()
+    assert json.loads(told)["exit_code"] == 1
+    assert again == shown == f"error: {visible(json.loads(told)['error'])}\n"
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ def live(folder: Path, *options: str) -> str:
 
 def test_the_whole_job(folder: Path) -> None:
     told = live(folder, "--clock-sigma", "0.1")
-    assert "20 moments, 34 positions; 1 malformed lines" in told
+    assert "20 moments, 34 positions; 1 malformed line" in told
     assert "last malformed line: not a line of JSON" in told
     offset = float(told.split("images are ")[1].split(" ")[0])
     sigma = float(told.split("± ")[1].split(" ")[0])
@@ -156,8 +156,8 @@ def test_wrong_times_are_told(folder: Path) -> None:
     texts += [json.dumps(line | {"time": line["time"] + 3600.0}) for line in stamped]
     (folder / "lines.jsonl").write_text("\n".join(texts) + "\n")
     told = " ".join(live(folder, "--clock-sigma", "0.1").split())
-    assert "40 moments, 68 positions; 1 moments left out, whose times the ones before and after contradict" in told
-    assert "times jumped 1 times and stayed: followed, with new tracks; the last jump was 3,598.1 s ahead" in told
+    assert "40 moments, 68 positions; 1 moment left out, whose times the ones before and after contradict" in told
+    assert "times jumped (1 x) and stayed: followed, with new tracks; the last jump was 3,598.1 s ahead" in told
     assert "last malformed line: time 1e+13: seconds are needed" in told
 
 

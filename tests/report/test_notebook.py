@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import copy
 import io
 import sys
 from html.parser import HTMLParser
@@ -98,6 +99,7 @@ def test_a_camera_is_the_table_of_the_command_line(calibrated: Any, tmp_path: Pa
 def test_cameras_that_no_table_shows_have_their_repr() -> None:
     batch = Camera(CAMERA.params.expand(2, -1), size=CAMERA.size, model=CAMERA.model)
     assert batch._repr_html_() is None
+    assert copy.deepcopy(CAMERA).to("meta")._repr_html_() is copy.deepcopy(RIG).to("meta")._repr_html_() is None
     learned = Camera.build(focal=(900, 900), center=(300, 300), size=(640, 480))
     learned.params.requires_grad_()
     assert "640x480" in read(learned).text
