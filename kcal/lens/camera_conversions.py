@@ -303,7 +303,7 @@ class ConvertibleCamera(CameraParameters):
                 f"K: a skew of {skew:g} px, which cv2.projectPoints ignores; set it to 0 for the same pixels, or use "
                 "it with Camera.build(..., skew=...)"
             )
-        values = torch.cat([torch.tensor([fx, fy, cx, cy, skew]).double(), lens.flatten().double()])
+        values = torch.cat([matrix.new_tensor([fx, fy, cx, cy, skew]), lens.flatten().double()])
         if fisheye:
             values = torch.nn.functional.pad(values, (0, 9 - len(values)))
         camera = cls(values, size=size, model=PRESETS["fisheye4" if fisheye else OPENCV_MODELS[lens.numel()]])

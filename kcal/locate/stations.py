@@ -92,7 +92,8 @@ def stated_mounting(
         >>> drone.covariance[3:, 3:].diagonal().sqrt().rad2deg().round(decimals=6).tolist()
         [0.0, 0.5, 1.0]
     """
-    sigma = torch.tensor([*sigma_m, *(math.radians(one[1]) for one in (heading_deg, pitch_deg, roll_deg))])
+    angles = (math.radians(one[1]) for one in (heading_deg, pitch_deg, roll_deg))
+    sigma = torch.tensor([*sigma_m, *angles], dtype=torch.float64)
     if not bool((sigma.isfinite() & (sigma >= 0)).all()):
         raise InputError("a station: sigmas must be finite and not negative")
     axes = _axes(heading_deg[0], pitch_deg[0], roll_deg[0])

@@ -601,7 +601,7 @@ def _parsed_row(where: str, cells: dict[str, str], fingerprint: str) -> HistoryR
         every += [float(cells["lasting"]), float(cells["time"]), float(warm or 0.0)]
         if not all(map(math.isfinite, every)):
             raise ValueError("not finite")
-        turn, left, right, between, both = (torch.tensor(every[:-3]).double() / _UNITS).split([6, 6, 6, 5, 15])
+        turn, left, right, between, both = (_UNITS.new_tensor(every[:-3]) / _UNITS).split([6, 6, 6, 5, 15])
         look = no_look()._replace(
             turn=turn, covariance=torch.block_diag(_from_upper(left, 3, told[0]), _from_upper(right, 3, told[1])),
             seen=told[:2], lasting=torch.tensor(every[-3], dtype=torch.float64),

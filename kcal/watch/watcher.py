@@ -91,7 +91,8 @@ class Watched:
         if self.times and not row.time > self.times[-1]:
             raise InputError(f"time {row.time:g}: not after that of the last measurement, {self.times[-1]:g}")
         if self.times:
-            state, _ = past.passed(self.states[-1], torch.tensor(row.time - self.times[-1]).double(), self.model)
+            gap = torch.tensor(row.time - self.times[-1], dtype=torch.float64)
+            state, _ = past.passed(self.states[-1], gap, self.model)
         else:
             state = past.first_state(self.model)
         self.times.append(row.time)
@@ -119,7 +120,7 @@ class Watched:
             raise InputError(f"time {time:.0f} s: the history of the rig tells nothing of that time; {begin}")
         if self._smooth is None and k + 1 < len(self.times):
             self._smooth = past.smoothed(self.states, self.times, self.model)
-        state, _ = past.passed(self.states[k], torch.tensor(time - self.times[k]).double(), self.model)
+        state, _ = past.passed(self.states[k], torch.tensor(time - self.times[k], dtype=torch.float64), self.model)
         if self._smooth is not None and k + 1 < len(self.times):
             state = past.smoothed([state, self._smooth[k + 1]], [time, self.times[k + 1]], self.model)[0]
         return past.turns_of(state, self.model, gusts=gusts)

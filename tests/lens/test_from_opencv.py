@@ -12,7 +12,7 @@ import torch
 
 from kcal import Camera, InputError, KcalWarning, Rig
 
-K = np.array([[800.0, 0, 322], [0, 820, 238], [0, 0, 1]])
+K = np.array([[800.1, 0, 322.3], [0, 820.7, 238.2], [0, 0, 1]])  # none of which a float32 holds
 D = np.array([-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.02, -0.01, 2e-3, 1e-3, -5e-4, 4e-4, 1e-4, 0.01, -0.02])
 SIZE = (640, 480)
 POINTS = np.array([[0.3, -0.2, 1.0], [-0.1, 0.2, 2.0], [0.05, 0.02, 0.7]])
