@@ -28,6 +28,7 @@ from kcal.file_kind import file_kind
 from kcal.files import read_bytes
 from kcal.native_file import digest
 from kcal.strict_json import MOST_BYTES, read_json
+from kcal.texts import counted_text
 
 _Summary = TypeVar("_Summary", bound=pydantic.BaseModel)
 
@@ -74,7 +75,7 @@ def _show_foreign(file: Path) -> None:
         kind = file_kind(file)
         raise FileError(f"{file}: kcal show knows camera, rig and observations files, not {kind} files")
     found = kcal.lens.import_cameras(file)
-    out.print(f"{file}: {found.format}, {len(found.cameras)} cameras")
+    out.print(f"{file}: {found.format}, {counted_text(len(found.cameras), 'camera')}")
     for note in found.notes:
         out.print(f"  {note}")
     _print(itertools.chain(*(shown.camera_blocks(*shown.derived_camera(camera)) for camera in found.cameras)))

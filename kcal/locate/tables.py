@@ -554,7 +554,8 @@ def _check_header(
     for column in names:
         # Where others are welcome, one that is nearly a known one is a slip only if a known one is missing.
         if column not in columns and (not extras or missing or not column or column.lower() in columns):
-            near = difflib.get_close_matches(column.lower(), columns, n=1, cutoff=0.5)
+            exchanged = [one for one in columns if sorted(one) == sorted(column.lower())]  # u_left for left_u
+            near = exchanged or difflib.get_close_matches(column.lower(), columns, n=1, cutoff=0.5)
             if near or not extras or not column:
                 hint = f"did you mean {near[0]!r}?" if near else f"the header is {header}"
                 raise FileError(f"{where}: unknown column {column!r}; {hint}")

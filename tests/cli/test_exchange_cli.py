@@ -85,7 +85,7 @@ def test_rigs(tmp_path: Path, camera: Path) -> None:
     assert load_rig(tmp_path / "back.json").right_from_left_translation.tolist() == pytest.approx([-1.5, 0, 0])
     assert "baseline 1.5 m" in run("show", tmp_path / "rig.json")
     run("export", f"{tmp_path / 'rig.json'}:left", "-o", tmp_path / "left.txt")
-    with pytest.raises(InputError, match="2 cameras; name one of"):
+    with pytest.raises(InputError, match=r"2 cameras; name one of .left., .right., for example \S*rig.json:left$"):
         run("diff", tmp_path / "rig.json", camera)
 
 

@@ -48,6 +48,7 @@ ROW = "a,1,2,3,4\n"
         (HEADER, "no rows under the header"),
         ("name,left_u,left_y,right_u,right_v\n" + ROW, "line 1: unknown column 'left_y'; did you mean 'left_v'"),
         ("name,Left_U,left_v,right_u,right_v\n" + ROW, "did you mean 'left_u'"),
+        ("name,u_left,v_left,u_right,v_right\n" + ROW, "'u_left'; did you mean 'left_u'"),
         ("name,left_u,left_v,right_u,right_v,temperature\n" + ROW, "unknown column 'temperature'; the header is"),
         ("name,left_u,left_v,right_u\na,1,2,3\n", "line 1: the column 'right_v' is missing"),
         ("name,left_u,left_u,right_u,right_v\n" + ROW, "'left_u' is there twice"),
