@@ -49,6 +49,9 @@ class Record(pydantic.BaseModel):
 
     __repr__ = brief
 
+    def __str__(self) -> str:
+        return repr(self)
+
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     _LATER: ClassVar[Mapping[str, Any]] = {}
 

@@ -77,6 +77,7 @@ def test_results() -> None:
     found = calibrated()
     check(found, f"CameraCalibrationResult(rms={found.rms:.6g}, ", "camera=Camera(model=opencv5", "per_view_rms=(5,)")
     check(found.observations, "board=Board(columns=7, rows=6, square=0.05)", "(1920, 1080)", "5 View")
+    assert str(found.observations) == repr(found.observations)
     check(found.observations.views[0], "View(name='0', pixels=42 tuple)", lines=1)
     check(found.camera.calibration, "CameraCalibration(", "sigma=9 entries")
     check(found.camera.calibration.record, "views=5, points=210", "rms=")

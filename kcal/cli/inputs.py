@@ -47,7 +47,8 @@ def picked(found: rooms.ImportedCameras, name: str | None, source: str) -> kcal.
         return found.cameras[("left", "right").index(name)]
     if name is None or names.count(name) != 1:
         wrong = f"no camera {name!r}" if name else f"{len(names) + len(found.unread)} cameras"
-        listed, example = ", ".join(map(repr, names)), f"{str(source).removesuffix(f':{name}')}:{names[0]}"
+        names = ["left", "right"] if len(names) == 2 and len(set(names)) == 1 else names
+        listed, example = ", ".join(map(repr, names)), f"{source.removesuffix(f':{name}')}:{names[0]}"
         raise InputError(f"{source}: {wrong}; name one of {listed}, for example {example}")
     return found.cameras[names.index(name)]
 

@@ -94,7 +94,7 @@ def test_show(tmp_path: Path, camera: Path) -> None:
     assert "camera north" in text
     assert "sigma in the image" in text
     run("export", camera, "-o", tmp_path / "cameras.txt")
-    assert "colmap, 1 cameras" in run("show", tmp_path / "cameras.txt")
+    assert "colmap, 1 camera" in run("show", tmp_path / "cameras.txt")
 
 
 def test_corners_and_surveys(tmp_path: Path) -> None:
@@ -102,9 +102,9 @@ def test_corners_and_surveys(tmp_path: Path) -> None:
     (tmp_path / "c.vnl").write_text("\n".join(["# filename x y level", *rows]))
     text = run("import", tmp_path / "c.vnl", "--board", "3x2", "--square", "25mm", "--size", "64x48",
                "-o", tmp_path / "c.obs.json")  # fmt: skip
-    assert "1 views with 6 corners, without weights" in text
+    assert "1 view with 6 corners, without weights" in text
     assert Observations.load(tmp_path / "c.obs.json").image_size == (64, 48)
-    assert "1 views with 6 corners" in run("show", tmp_path / "c.obs.json")
+    assert "1 view with 6 corners" in run("show", tmp_path / "c.obs.json")
     (tmp_path / "s.gpx").write_text('<gpx><wpt lat="19.07" lon="72.87"><ele>80</ele><name>post</name></wpt></gpx>')
     run("import", tmp_path / "s.gpx", "--survey-sigma", 0.02, "--geoid", -66, "-o", tmp_path / "s.csv")
     survey = read_survey(tmp_path / "s.csv")

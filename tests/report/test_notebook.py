@@ -126,7 +126,7 @@ def test_calibrations_and_observations_are_their_pictures(calibrated: Any) -> No
     assert all(text in found.text for text in calibrated.warnings)
     seen = read(observed())
     assert len(seen.pictures) == 1
-    assert "5 views with 210 corners, 1 images without" in seen.text
+    assert "5 views with 210 corners, 1 image without" in seen.text
     assert "<b>north & \\x1b[2J$x^$: blurred" in seen.text
     empty = Observations(board=Board(columns=7, rows=6, square=0.05), image_size=(9, 9), views=())
     assert read(empty).pictures == []
