@@ -8,6 +8,7 @@ import math
 import torch
 from torch import Tensor
 
+from kcal.checks import chi2_tail
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import fit_turn, rotation_between, seen_turned
@@ -250,12 +251,9 @@ def _judged(
     found = float((weight[:, None] * torch.where(weight[:, None] > 0, away, 0.0).square()).sum())
     if not expected > 0:
         return sigma, None, None
-    # Here, because SciPy takes long to load.
-    from scipy.special import chdtrc
-
     # The weighted sum of squares of normal errors has nearly a scaled χ² distribution (Satterthwaite 1946).
     scale, degrees = squared / expected, expected**2 / squared
-    probability = float(chdtrc(degrees, found / scale))
+    probability = float(chi2_tail(found / scale, degrees))
     sigma = torch.where(weight > 0, sigma, torch.nan)
     return sigma, math.sqrt(found / expected), probability
 

@@ -147,11 +147,19 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
     rotation = as_tensor("rotation", rotation)
     if rotation.shape[-2:] != (3, 3):
         raise InputError(f"rotation: shape (..., 3, 3) is needed, got {tuple(rotation.shape)}")
-    # kornia takes long to load.
-    from kornia.geometry.conversions import rotation_matrix_to_axis_angle
-
-    flat: Tensor = rotation_matrix_to_axis_angle(rotation.reshape(-1, 3, 3))
-    return flat.reshape(*rotation.shape[:-2], 3)
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotation.unbind(-2))
+    # The products of a quaternion's components: each row is the quaternion, and nothing cancels in the longest.
+    turned, first, second, third = h - f, b + d, c + g, f + h
+    tall, flat, low = c - g, d - b, 1.0 + a + e + i
+    rows = [low, turned, tall, flat, turned, 1.0 + a - e - i, first, second]
+    rows += [tall, first, 1.0 - a + e - i, third, flat, second, third, 1.0 - a - e + i]
+    every = torch.stack(rows, -1).unflatten(-1, (4, 4))
+    longest = every.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*every.shape[:-2], 1, 4)
+    quaternion = every.gather(-2, longest)[..., 0, :]
+    cosine, along = quaternion[..., :1].abs(), quaternion[..., 1:] * torch.where(quaternion[..., :1] < 0, -1.0, 1.0)
+    square = along.square().sum(-1, keepdim=True)
+    sine = torch.where(square > 0, square, 1.0).sqrt()
+    return 2.0 * along * torch.where(square > 0, torch.atan2(sine, cosine) / sine, 1.0 / cosine)
 
 
 def enu_from_cam(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Tensor:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.checks import as_points
+from kcal.checks import as_points, chi2_tail
 from kcal.errors import FileError, InputError
 from kcal.finding import Finding
 from kcal.lens.camera import Camera
@@ -621,9 +621,7 @@ def _noisier(covariance: Callable[[Tensor], Tensor], error: Tensor) -> Cause:
 
 def _chance(chi2: float, freedom: int) -> float:
     """Probability of a χ² as large or larger; 1 without freedom."""
-    from scipy.special import chdtrc  # which few need
-
-    return float(chdtrc(freedom, max(chi2, 0.0))) if freedom else 1.0
+    return float(chi2_tail(chi2, freedom)) if freedom else 1.0
 
 
 _CURES = {

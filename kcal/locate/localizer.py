@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from kcal.checks import StatedModule, as_points, as_tensor, expanded, scalar
+from kcal.checks import StatedModule, as_points, as_tensor, chi2_quantile, expanded, scalar
 from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
@@ -196,9 +196,6 @@ class Localizer(Operations, Movable, StatedModule):
             for name in names:
                 self.register_buffer(name, None)
             return
-        # SciPy takes long to load.
-        from scipy.special import chdtri
-
         up = heights = None
         if rig.origin is not None:
             assert self.ecef_from_enu is not None
@@ -208,8 +205,8 @@ class Localizer(Operations, Movable, StatedModule):
         errors, bending, self.lens = errors_by_camera(rig)
         bending = None if bending is None else bending * self.half_curvature
         freedom = 2.0 * torch.arange(len(rig) + 1, dtype=torch.float64) - 3.0
-        limits = [[float(chdtri(max(float(f), 1.0), p)) for f in freedom] for p in (_BAD, _DOUBTFUL)]
-        values = up, heights, errors, bending, torch.tensor(limits, dtype=torch.float64, device=rig.translation.device)
+        limits = torch.stack([chi2_quantile(freedom.clamp_min(1.0), 1.0 - p) for p in (_BAD, _DOUBTFUL)])
+        values = up, heights, errors, bending, limits.to(rig.translation.device)
         for name, value in zip(names, values, strict=True):
             self.register_buffer(name, value)
 

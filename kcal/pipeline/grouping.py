@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kcal.checks import chi2_tail
 from kcal.errors import InputError
 from kcal.files import read_bytes
 from kcal.lens.rig import Rig
@@ -270,8 +271,6 @@ class _Scene:
 
     def _fitted(self, groups: list[tuple[int, ...]]) -> list[_Group]:
         """Groups of three views and more, fitted; one view that contradicts is left out."""
-        from scipy.special import chdtri
-
         good, gate = [], self.options.gate**2
         for _ in range(2):
             again: set[tuple[int, ...]] = set()
@@ -289,7 +288,7 @@ class _Scene:
                 for group, value, count, there, one in zip(
                     part, chi2.tolist(), views.tolist(), ahead.tolist(), worst, strict=True
                 ):
-                    if there and count > 2 and value < chdtri(2 * count - 3, 1e-4):
+                    if there and count > 2 and float(chi2_tail(value, 2 * count - 3)) > 1e-4:
                         good.append(_Group(group, (count - 1) * gate - value))
                     elif count > 3:
                         again.add(tuple(-1 if c == one else mark for c, mark in enumerate(group)))

@@ -13,6 +13,7 @@ from torch import Tensor
 
 import kcal.pipeline.imm_filter as imm
 import kcal.pipeline.measurements as measured
+from kcal.checks import chi2_quantile, chi2_tail
 from kcal.dispatch import known_true
 from kcal.errors import InputError
 from kcal.lens.pose import side_axes
@@ -350,9 +351,6 @@ class Tracker:
     ) -> None:
         if moments is not None and (compiled or record):
             raise InputError("a rig that moves: neither compiled filters nor records are possible")
-        # SciPy takes long to load.
-        from scipy.special import chdtrc, chdtri
-
         self.localize = localize.weighing_all()
         self.solved, self.moments, self.options = self.localize, moments, options or TrackOptions()
         rig, errors = self.localize.rig, self.localize.errors
@@ -372,9 +370,8 @@ class Tracker:
         device = rig.center.device
         self.shared = SharedErrors(self.calibration, priors, device)
         # By the number of cameras: squared distances that lose as many sightings as `gate` does of two.
-        loss = chdtrc(4, self.options.gate)
-        limits = [float(chdtri(2 * max(count, 1), loss)) for count in range(len(rig) + 1)]
-        self.gates = torch.tensor(limits, dtype=torch.float64, device=device)
+        loss, counts = float(chi2_tail(self.options.gate, 4)), torch.arange(len(rig) + 1.0)
+        self.gates = chi2_quantile(2.0 * counts.clamp_min(1.0), 1.0 - loss).to(device)
         self._stands: Localizer | None = None
         self.time = -math.inf
         self.records: list[TrackRecord] = []

@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 from torch import Tensor
 
 from kcal.calibrate.rig.pairs import pose_alone
+from kcal.checks import chi2_quantile
 from kcal.corners.images import decode_image, to_8bit
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError, with_extra
@@ -45,7 +45,7 @@ _FAR = 1e5
 # Numbers from here on are Unix seconds; below they count from the beginning of a video.
 _UNIX = 1e8
 # 95 % of a Gaussian in three dimensions: its ellipsoid is so many sigma wide.
-_REACH = float(chdtri(3, 0.05)) ** 0.5
+_REACH = float(chi2_quantile(3, 0.95)) ** 0.5
 _CAMERAS = ((86, 156, 255), (255, 120, 100), (120, 220, 140), (230, 170, 255))
 _TARGETS, _LANDMARKS, _FAINT = (255, 190, 40), (90, 230, 120), (130, 130, 130)
 

@@ -8,7 +8,6 @@ from collections.abc import Hashable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import torch
-from scipy.special import ndtri, stdtrit
 from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
@@ -105,6 +104,8 @@ class SettingSpline:
         estimated, errors have Student's distribution of m degrees of freedom; they are stated as normal ones that
         are as wide at 95 %.
         """
+        from scipy.special import ndtri, stdtrit  # which takes long to load
+
         solution, right = self._solved(at)
         widen = float(stdtrit(self.degrees, _QUANTILE) / ndtri(_QUANTILE))
         variance = (-(solution @ right)).clamp_min(0.0) / self.degrees
