@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 
@@ -257,6 +258,17 @@ def test_recognized_by_its_motion_after_an_occlusion(again: float, number: int) 
     assert float(tracks.unseen_s[0]) == 0.0
     assert told[40] == (), "lost"
     assert told[-1] == (number,)
+
+
+def test_what_is_told_may_be_differentiated_further() -> None:
+    localize, (start, velocity) = tracked_site(0.003), scattered(3, 1)
+    tracker = Tracker(localize, STEADY)
+    tracks, _ = followed(tracker, [localize.rig] * 3, start, velocity, 4, 5)
+    weight = torch.ones(3, 3, dtype=torch.float64, requires_grad=True)
+    (weight * tracks.state.enu).sum().backward()
+    assert weight.grad is not None and torch.equal(weight.grad, tracks.state.enu)
+    again = copy.deepcopy(tracker).tracks()
+    assert again.number == tracks.number and torch.equal(again.state.enu, tracks.state.enu)
 
 
 def test_what_is_seen_once_is_not_told() -> None:
