@@ -14,7 +14,9 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib import patheffects, rc_context
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import BoundaryNorm, Colormap
@@ -46,10 +48,7 @@ class PlainFigure(Figure):
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw everything; called by the canvas."""
-        for axes in self.findobj(Axes):
-            finished(axes)
-        for text in self.findobj(Text):
-            _make_plain(text)
+        _make_plain(self)
         with warnings.catch_warnings():
             # A character that the font does not have is drawn as a box.
             warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from font")
@@ -58,15 +57,7 @@ class PlainFigure(Figure):
 
 def finished(axes: Axes) -> Figure:
     """Let the texts of a panel be drawn as they are, also in a figure of the caller's; the figure around it."""
-    for axis in (axes.xaxis, axes.yaxis):
-        # Names at ticks are written anew at each drawing, by a function.
-        names = axis.get_major_formatter()
-        if isinstance(names, FuncFormatter):
-            axis.set_major_formatter(partial(_shown_tick, names.func))
-        # This makes the labels of ticks, which otherwise appear only while they are drawn.
-        axis.get_ticklabels(which="both")
-    for text in axes.findobj(Text):
-        _make_plain(text)
+    _make_plain(axes)
     return whole(axes.figure)
 
 
@@ -77,9 +68,14 @@ def whole(figure: Figure | SubFigure) -> Figure:
     return root
 
 
-def _make_plain(text: Text) -> None:
-    text.set_parse_math(False)
-    text.set_text(_shown(text.get_text()))
+def _make_plain(parts: Artist) -> None:
+    for part in parts.findobj(lambda each: isinstance(each, Text | Axis)):
+        if isinstance(part, Text):
+            part.set_parse_math(False)
+            part.set_text(_shown(part.get_text()))
+        # Names at ticks are written anew at each drawing, by a function.
+        elif isinstance(part, Axis) and isinstance(names := part.get_major_formatter(), FuncFormatter):
+            part.set_major_formatter(partial(_shown_tick, names.func))
 
 
 def _shown_tick(names: Callable[[float, int | None], str], at: float, place: int | None) -> str:
