@@ -61,9 +61,9 @@ def refuse_same_camera(data: RigData) -> None:
 
 def refuse_one_place(data: RigData, solution: RigSolution) -> None:
     """Raise `InputError` if one camera was given at two places, and its images come from one and the same."""
-    state = solution.state
-    for second, lens in enumerate(data.lenses):
-        for first in (c for c in range(second) if data.lenses[c] == lens):
+    state, lenses = solution.state, data.lenses
+    for second, lens in enumerate(lenses):
+        for first in (c for c in range(second) if lenses[c] == lens):
             rows = solution.relative_rows(first, second)[3:]
             shift = state.rotation[second] @ (state.center[first] - state.center[second])
             known, determined = solution.of(rows)
@@ -79,7 +79,7 @@ def refuse_one_place(data: RigData, solution: RigSolution) -> None:
 def one_camera_doubts(data: RigData) -> list[Finding]:
     """Doubt boards seen by one camera from two places, which it cannot have seen at the same moment."""
     assert data.boards is not None
-    seen = torch.isfinite(data.boards.pixels).all(-1).any(-1)
+    seen, lenses = torch.isfinite(data.boards.pixels).all(-1).any(-1), data.lenses
     return [
         Finding(
             "synchronization",
@@ -88,9 +88,9 @@ def one_camera_doubts(data: RigData) -> list[Finding]:
             "from both: this is right only if no board moved while the camera was moved",
             "otherwise leave --pairs out",
         )
-        for second, lens in enumerate(data.lenses)
+        for second, lens in enumerate(lenses)
         for first in range(second)
-        if data.lenses[first] == lens and (count := int(seen[:, [first, second]].all(-1).sum()))
+        if lenses[first] == lens and (count := int(seen[:, [first, second]].all(-1).sum()))
     ]
 
 

@@ -335,7 +335,8 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
     """What may change of cameras, board and air, the data with the board as it is expected, and doubts of it."""
     boards, doubts = data.boards, list[Finding]()
     # One camera at several places has one lens.
-    places = {lens: [c for c, own in enumerate(data.lenses) if own == lens] for lens in data.lenses}
+    lenses = data.lenses
+    places = {lens: [c for c, own in enumerate(lenses) if own == lens] for lens in lenses}
     cameras = tuple(data.cameras[lens] for lens in places)
     if options.intrinsics == "prior":
         known = []
@@ -352,13 +353,13 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
             unknowns = _lens_unknowns(cameras, tuple(camera.fingerprint for camera in cameras), tuple(known))
         else:
             parts, apart = gathered(cameras, known, boards.board)
-            lenses = list(places)
+            firsts = list(places)
             measured = boards.deviation is not None
             doubts = [
                 Finding(
                     "board",
                     "doubt",
-                    f"the calibrations of {data.names[lenses[one]]} and {data.names[lenses[other]]} contradict each "
+                    f"the calibrations of {data.names[firsts[one]]} and {data.names[firsts[other]]} contradict each "
                     f"other about their board ({boards.board}): two prints, or one that bent in between",
                     "calibrate both cameras from views of the board in the pairs",
                 )
@@ -371,7 +372,7 @@ def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, Share
         names = [" and ".join(data.names[c] for c in at) for at in places.values()]
         unknowns = held(cameras) if options.intrinsics == "fixed" else free(cameras, names)
     # The same lens has the same unknowns at all places.
-    each = tuple(unknowns.cameras[list(places).index(lens)] for lens in data.lenses)
+    each = tuple(unknowns.cameras[list(places).index(lens)] for lens in lenses)
     unknowns = dataclasses.replace(unknowns, cameras=each)
     if boards is not None:
         doubts += one_camera_doubts(data)

@@ -500,10 +500,8 @@ class RigData:
         come from a calibration, as its record says. Two cameras of one type have equal nominal parameters, and two
         lenses. A lens is one block of unknowns: its data count once, and its errors are the same at all places.
         """
-        return tuple(
-            next((first for first in range(c) if _same_lens(self.cameras[first], camera)), c)
-            for c, camera in enumerate(self.cameras)
-        )
+        first = dict[object, int]()
+        return tuple(first.setdefault(_lens_of(camera), c) for c, camera in enumerate(self.cameras))
 
     @property
     def sources(self) -> tuple[Source, ...]:
@@ -533,8 +531,7 @@ class RigData:
         return any(source.absolute for source in self.sources)
 
 
-def _same_lens(one: Camera, other: Camera) -> bool:
-    if one.calibration is None or other.calibration is None:
-        return False
-    measured = one.calibration.record is not None and other.calibration.record is not None
-    return one is other or (measured and one.fingerprint == other.fingerprint)
+def _lens_of(camera: Camera) -> object:
+    if (known := camera.calibration) is None:
+        return object()
+    return camera if known.record is None else camera.fingerprint
