@@ -406,7 +406,9 @@ class Tracker:
         # Operations of small tensors take a sixth less time in this mode, which compiled steps do not know.
         with torch.no_grad() if self._compiled else torch.inference_mode():
             found = self._taken(views, time)
-        plain = {name: value.clone() for name, value in found._asdict().items() if isinstance(value, Tensor)}
+        plain: dict[str, Any] = {
+            name: value.clone() for name, value in found._asdict().items() if isinstance(value, Tensor)
+        }
         return found._replace(state=TrackStates(*(value.clone() for value in found.state)), **plain)
 
     def _taken(self, views: ObjectViews, time: float | None) -> Tracks:

@@ -7,7 +7,8 @@ import io
 import math
 import textwrap
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -74,7 +75,11 @@ def _make_plain(parts: Artist) -> None:
             part.set_text(_shown(part.get_text()))
         # Names at ticks are written anew at each drawing, by a function.
         elif isinstance(part, Axis) and isinstance(names := part.get_major_formatter(), FuncFormatter):
-            part.set_major_formatter(lambda at, place, names=names.func: _shown(names(at, place)))
+            part.set_major_formatter(partial(_shown_tick, names.func))
+
+
+def _shown_tick(names: Callable[[float, int | None], str], at: float, place: int | None) -> str:
+    return _shown(names(at, place))
 
 
 def _shown(text: str) -> str:

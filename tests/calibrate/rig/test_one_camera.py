@@ -107,7 +107,7 @@ def test_the_lens_is_one() -> None:
     torch.testing.assert_close(own, covariance[:size, size : 2 * size], rtol=1e-12, atol=0)
     assert float(own[0, 0]) > 0
     nominal = TRUE, TRUE.with_parameters(TRUE.params.clone())
-    assert rig(nominal, survey(0)).data.lenses == (0, 1)
+    assert rig(nominal, survey(0)).data.lenses == rig((TRUE, TRUE), survey(0)).data.lenses == (0, 1)
     two = rig((camera, calibrated(100)), survey(0))
     assert two.data.lenses == (0, 1)
     assert float(two.joint_covariance()[0, size].abs()) < 0.5 * float(own[0, 0])
