@@ -10,6 +10,7 @@ errors, files and checks), which every room may import.
 from __future__ import annotations
 
 import ast
+import itertools
 from pathlib import Path
 
 import matplotlib
@@ -28,9 +29,9 @@ WIDTH, HEIGHT = 0.92, 0.5  # of a box; columns and floors are 1 apart
 LOOKS = {
     "cli": (3.3, "commands"),
     "report": (1.6, "pictures and maps"),
-    "mark": (2.75, "marking page"),
-    "pipeline": (5.1, "tracks, streams"),
-    "capture": (5.7, "guided photography"),
+    "mark": (2.6, "marking page"),
+    "pipeline": (5.7, "tracks, streams"),
+    "capture": (5.1, "guided photography"),
     "web": (5.7, "local pages"),
     "calibrate/batch": (4.0, "many cameras"),
     "calibrate/hybrid": (2.95, "hybrid lens"),
@@ -38,9 +39,9 @@ LOOKS = {
     "calibrate/camera": (2.8, "one camera"),
     "calibrate/rig": (1.0, "several cameras"),
     "nets": (4.55, "learned inverse"),
-    "stars": (3.95, "stars of the night"),
+    "stars": (3.65, "stars of the night"),
     "scene": (2.4, "matches of the scene"),
-    "skyline": (5.1, "skyline and terrain"),
+    "skyline": (4.65, "skyline and terrain"),
     "watch": (4.6, "a rig over time"),
     "sim": (0.0, "simulated truth"),
     "io": (1.0, "files"),
@@ -112,6 +113,10 @@ def draw(path: Path) -> None:
     rooms = read_imports()
     level = floors(rooms)
     place = {room: (LOOKS.get(room, (5.4, ""))[0], float(level[room])) for room in rooms if room != BOTTOM}
+    boxes = sorted((y, x, room) for room, (x, y) in place.items())
+    for (y, x, room), (other_y, other_x, other) in itertools.pairwise(boxes):
+        if y == other_y and other_x - x < WIDTH:
+            raise ValueError(f"{room} and {other} overlap: give them other columns in LOOKS")
     left, right = min(x for x, _ in place.values()), max(x for x, _ in place.values())
     figure, axes = plt.subplots(figsize=(11, 8.5), layout="constrained")
     for room, (x, y) in place.items():

@@ -18,7 +18,6 @@ ASSETS = Path(__file__).resolve().parent.parent / "assets"
 BOARDS = (("9x6", "25mm", "A4"), ("7x6", "50mm", "A2"))
 FROM_DEMO = {
     "map.png": "demo-map.png",
-    "left.png": "demo-coverage.png",
     "rig.json": "sample-rig.json",
     "points.csv": "sample-points.csv",
 }
