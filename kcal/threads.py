@@ -259,7 +259,7 @@ def deaf_to_interrupts() -> Iterator[None]:
 
 @contextmanager
 def work_limit(seconds: float) -> Iterator[None]:
-    """End this process if it takes more processor time meanwhile (on Windows, if more time passes).
+    """End this process if it takes more CPU time meanwhile (on Windows, if more time passes).
 
     A Python signal handler would wait for a C++ library to return.
     """

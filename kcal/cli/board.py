@@ -157,7 +157,7 @@ def detect_command(
         output: Observations file to write.
         gallery: Images that failed and why, then the views with their corners, worst first.
         coverage: Where in the image corners were seen.
-        time_limit: Seconds of processor time after which the search in one image is given up.
+        time_limit: Seconds of CPU time after which the search in one image is given up.
         duration: Seconds for which a stream is watched.
         keep: Folder for the frames of a video or stream that became views, as PNG.
         topic: Of a bag that has images of several. Two, of the cameras of a rig, give two files, NAME_left and

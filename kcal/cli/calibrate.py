@@ -374,7 +374,7 @@ def batch_command(
         one_type: The cameras, four or more, are of one type: each learns from the others.
         workers: Processes on this machine; one per core if 0.
         scheduler: Dask scheduler whose workers see the same files: tcp://host:8786.
-        time_limit: Seconds of processor time for one image or one calibration.
+        time_limit: Seconds of CPU time for one image or one calibration.
     """
     given = given_board(board, square)
     if model != "hybrid":

@@ -242,7 +242,7 @@ def recognize_images(images: Iterable[Any], most: int, time_limit: float | None 
     Args:
         images: images, or files; those that cannot be read are passed over.
         most: images to look at.
-        time_limit: seconds of processor time for each.
+        time_limit: seconds of CPU time for each.
     """
     seen: list[SeenBoard | None] = []
     found = board_of_most(seen)
@@ -271,7 +271,7 @@ def recognize_board(
         paths: as in `detect`; or an iterator of images, which are looked at in turn.
         square: side of its squares or tags with the unit, such as `25mm`: images do not tell it. Markers and gaps are
             measured in terms of it.
-        time_limit: seconds of processor time for each image; no limit by default.
+        time_limit: seconds of CPU time for each image; no limit by default.
         note: called with what was recognized, and in how many images.
 
     Raises:

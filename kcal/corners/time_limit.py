@@ -1,4 +1,4 @@
-"""Limit the processor time of calls into C++ libraries that cannot be interrupted by a signal."""
+"""Limit the CPU time of calls into C++ libraries that cannot be interrupted by a signal."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class Limited:
 
     def _too_long(self) -> TookTooLongError:
         return TookTooLongError(
-            f"stopped at the time limit of {self.seconds:g} s of processor time (--time-limit); leave the image out, "
+            f"stopped at the time limit of {self.seconds:g} s of CPU time (--time-limit); leave the image out, "
             "or allow more time"
         )
 

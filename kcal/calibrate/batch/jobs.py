@@ -42,7 +42,7 @@ class BatchOptions:
         refine: how corners are refined, see `kcal.corners.refine.refine_corners`.
         board_warp: also estimate how each board bends.
         one_type: the cameras are of one type: each learns from the others what its lens is like.
-        time_limit: seconds of processor time for one image or one calibration, after which it is given up.
+        time_limit: seconds of CPU time for one image or one calibration, after which it is given up.
     """
 
     refine: Refinement = "erf"
