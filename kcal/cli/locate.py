@@ -224,8 +224,8 @@ def locate_command(
     below three sigma, only the bearing is given. Heights are ellipsoidal; with a geoid grid the files also contain the
     height of the geoid.
 
-    Light bends: `--refraction` lowers points by K d² / 2R at the level distance d, R being the Earth's radius, and what
-    is not known of K is part of the height's error, but not of the range's.
+    Light bends: `--refraction` lowers points by K d² / 2R at the horizontal distance d, R being the Earth's radius, and
+    what is not known of K is part of the height's error, but not of the range's.
 
     The rig file of a rig that was solved with landmarks contains its position: `--site` and `--heading` are then not
     needed. Without any position, points are meters in the rig's own frame, which is the left camera's (x right, y down,

@@ -382,7 +382,7 @@ class Surroundings(NamedTuple):
     Attributes:
         present: (..., C, N) bool: which camera saw what; all of them if None.
         up: (C, 3) the vertical at each camera, in its axes; straight lines of sight if None.
-        bending: 1/m: light from the level distance d comes from bending * d² too high: k / 2R.
+        bending: 1/m: light from the horizontal distance d comes from bending * d² too high: k / 2R.
         held: (..., 3, N) row of (a, b, ρ) that stays as it is at the start, over its sigma: a stated height.
         held_off: (..., N) by how much it is too high, over its sigma: zeros, with derivatives.
     """

@@ -75,9 +75,9 @@ class Localizer(Operations, Movable, StatedModule):
     A rig that says where it stands gives positions on the Earth: east, north, up of the origin, and WGS84. Otherwise
     they are in the rig's own frame, which is the left camera's for two cameras.
 
-    Light bends downward: a point at the level distance d is k d² / 2R lower than a straight line of sight says, with R
-    the Earth's radius and k the coefficient of refraction: 0.26 ± 0.20 m at 5 km, 0.01 m at 1 km. With all weights,
-    it bends at each camera about that one's vertical.
+    Light bends downward: a point at the horizontal distance d is k d² / 2R lower than a straight line of sight says,
+    with R the Earth's radius and k the coefficient of refraction: 0.26 ± 0.20 m at 5 km, 0.01 m at 1 km. With all
+    weights, it bends at each camera about that one's vertical.
 
     Geometry runs in float64 whatever the pipeline around it uses. There is no branch on values under `torch.compile`,
     `torch.export` and `vmap`: bad views are then sought once, and one is found; otherwise again until two are left.

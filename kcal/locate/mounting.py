@@ -20,7 +20,7 @@ MOUNTING_ERRORS = 7
 
 
 def attitude(enu_from_cam: Tensor) -> tuple[float, float, float]:
-    """Heading, pitch and roll in degrees of a rotation (3, 3): the inverse of `kcal.locate.geodesy.enu_from_cam`.
+    """Heading, pitch and roll in degrees of a rotation (3, 3): the inverse of `kcal.locate.enu_from_cam`.
 
     Example:
         >>> from kcal.locate import enu_from_cam

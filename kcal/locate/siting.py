@@ -99,7 +99,7 @@ def seen_over(surface: GroundSurface, eye: Tensor, points: Tensor, bending: floa
         surface: the ground.
         eye: (3,) east, north, up, meters.
         points: (N, 3).
-        bending: k / 2R, 1/m: light from the level distance d comes from bending · d² too high.
+        bending: k / 2R, 1/m: light from the horizontal distance d comes from bending · d² too high.
     """
     away = points[:, :2] - eye[:2]
     distance = torch.linalg.vector_norm(away, dim=-1)
@@ -152,7 +152,7 @@ class Site:
         origin: of the camera, its height above the ellipsoid.
         heading_deg: of the middle of its field of view, clockwise from true north; None: it looks all around, or, for a
             candidate that does not, the best heading is sought.
-        field_deg: level field of view, 360 for a tower that looks all around.
+        field_deg: horizontal field of view, 360 for a tower that looks all around.
         sigma_deg: standard deviation of a bearing: marks and heading together.
         elevation_sigma_deg: of an elevation; as of a bearing if left out.
         position_m: of the camera's position along each axis, meters.

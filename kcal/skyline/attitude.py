@@ -85,7 +85,7 @@ def raised_horizon(horizon: Horizon, raster: Raster, eye: Origin, error: RasterE
 
 
 def _seen_slopes(rays: TerrainRays, azimuth: Floats, distance: Floats) -> tuple[Floats, Floats]:
-    """Slopes (A, S) at which the ground is seen, -∞ where it is not known, and level distances, 1 there."""
+    """Slopes (A, S) at which the ground is seen, -∞ where it is not known, and horizontal distances, 1 there."""
     slope, level, _ = rays.seen(rays.along(azimuth), distance)
     known = np.isfinite(slope)
     return np.where(known, slope, -np.inf), np.where(known, level, 1.0)

@@ -370,7 +370,7 @@ def terrain_horizon(raster: Raster, eye: Origin, azimuth: Floats, *, refraction:
         raster: of heights above the ellipsoid, from `kcal.locate.terrain`.
         eye: where the camera is.
         azimuth: (A,) radians clockwise from north, increasing.
-        refraction: coefficient k: light from the level distance d comes from k d² / 2R too high.
+        refraction: coefficient k: light from the horizontal distance d comes from k d² / 2R too high.
 
     Raises:
         InputError: the eye is outside the raster, or below its ground.
@@ -452,7 +452,7 @@ class TerrainRays:
         return nodes @ weight if weight.ndim == 2 else np.einsum("avk,aks->avs", nodes, weight)
 
     def seen(self, nodes: Floats, distance: Floats) -> tuple[Floats, Floats, Floats]:
-        """Elevation as a slope (A, S), level distance (A, S) and height over the ellipsoid at distances."""
+        """Elevation as a slope (A, S), horizontal distance (A, S) and height over the ellipsoid at distances."""
         column, row, *_ = np.moveaxis(self.joined(nodes[:, :2], distance), 1, 0)
         height = self.raster.between(column, row)
         point = self.points(nodes, distance, height)
@@ -488,7 +488,7 @@ def _chebyshev_weights(nodes: Floats, at: Floats) -> Floats:
 
 
 def _highest(rays: TerrainRays, azimuth: Floats, distance: Floats) -> tuple[Floats, Floats, Floats, Bools, Floats]:
-    """Elevation, level distance, point, whether it is a horizon, and reach of the raster, of some azimuths."""
+    """Elevation, horizontal distance, point, whether it is a horizon, and reach of the raster, of some azimuths."""
     nodes, step = rays.along(azimuth), distance[1] - distance[0]
     slope, _, _ = rays.seen(nodes, distance)
     there = np.isfinite(slope)

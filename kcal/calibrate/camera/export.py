@@ -77,8 +77,8 @@ def refit_camera(
     """Fit a parametric model to a camera over its whole image, at infinity.
 
     The sum of squared distances in pixels is minimized on a grid of directions, with a weak prior on the coefficients.
-    The frame stays as it is, so a rig's pose is kept. A wandering entrance pupil is lost: points within a few meters
-    are seen elsewhere than by the original camera.
+    The frame stays as it is, so a rig's pose is kept. Movements of the entrance pupil are lost: points within a few
+    meters are seen elsewhere than by the original camera.
 
     Args:
         camera: a single camera, for example a hybrid one.

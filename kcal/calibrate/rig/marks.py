@@ -117,7 +117,7 @@ class Landmarks(MarkSource):
         return items[:, :3]
 
 
-# Light bends downward: a landmark at the level distance d is seen k d² / 2R higher than it stands, k being the
+# Light bends downward: a landmark at the horizontal distance d is seen k d² / 2R higher than it stands, k being the
 # coefficient of refraction and R the Earth's radius.
 
 # 1/m: half the curvature of the Earth, of the mean radius (IUGG) everywhere: a third of a percent of the bending.

@@ -155,7 +155,7 @@ def free(cameras: Sequence[Camera], names: Sequence[str]) -> SharedUnknowns:
 
 # px that a direction must move something seen, for it to be an unknown of the rig.
 _FELT = 1e-3
-# Meters of a nearby point, where the wandering of the entrance pupil shows, and px that a meter of board is there.
+# Meters of a nearby point, where the movement of the entrance pupil shows, and px that a meter of board is there.
 _NEAR, _PX_PER_METER = 1.0, 1000.0
 
 
