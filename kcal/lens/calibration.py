@@ -109,6 +109,8 @@ class CalibrationRecord:
         observations: name of the observations file, if there was one.
         temperature: of the camera when the views were taken, °C; None if nobody said.
         without: what a hybrid lens was told not to estimate of the views: "motion", "bending".
+        moves: standard deviations by which its ln scale and principal point (px) differ from view to view; (): they
+            do not.
         warnings: what should be doubted of it, a sentence each.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
         created: when, with its time zone.
@@ -131,12 +133,13 @@ class CalibrationRecord:
     board_deviation: tuple[tuple[float, float, float], ...] | None = None
     temperature: float | None = None
     without: tuple[str, ...] = ()
+    moves: tuple[float, ...] = ()
     warnings: tuple[str, ...] = ()
     kcal_version: str
     created: datetime.datetime
 
     def __post_init__(self) -> None:
-        _refuse_negative(self, ("rms", "per_view_rms", "iterations", "noise", "tempering"))
+        _refuse_negative(self, ("rms", "per_view_rms", "iterations", "noise", "tempering", "moves"))
         _refuse_local_time(self.created)
         if self.temperature is not None and not -273.15 <= self.temperature < 1000:
             raise InputError(f"temperature is {self.temperature}; degrees Celsius are needed")

@@ -287,11 +287,13 @@ def bent(
     return lines("bent", captures_of(kept, seeds, views, ("bent", "few bent", "bent, hand"), fits), *TERMS)
 
 
-@section("ordinary.md", "moving", seeds=range(1), kinds=("stand", "0.01 s apart, hand"))
-def moving(kept: Kept = NOT_KEPT, seeds: range = range(40), kinds: tuple[str, ...] = tuple(MOVING)) -> Iterator[str]:
-    """Captures of 16 views, and rigs."""
+@section("ordinary.md", "moving", seeds=range(1), rigs=range(1), kinds=("stand", "0.01 s apart, hand"))
+def moving(
+    kept: Kept = NOT_KEPT, seeds: range = range(17), rigs: range = range(3), kinds: tuple[str, ...] = tuple(MOVING)
+) -> Iterator[str]:
+    """Captures of 16 views, and rigs, of seeds of their own."""
     still = tuple(kind for kind in kinds if not KINDS[kind].apart)
-    return moving_lines([*captures_of(kept, seeds, (16,), still), *rigs_of(kept, seeds, kinds, ("default",))])
+    return moving_lines([*captures_of(kept, seeds, (16,), still), *rigs_of(kept, rigs, kinds, ("default",))])
 
 
 @section("ordinary.md", "rigs", seeds=range(1))

@@ -52,6 +52,8 @@ _LESS = 0.01
 # Standard deviations of a score from which amplitudes are asked for, and nats that these must be worth: of 18 simulated
 # captures of still lenses one had more, 3.7 and 3.1; those whose principal points moved by 15 px mostly 2.2 and 4.6.
 _ASKED, _SURE = 2.0, 4.0
+# Share of captures in which lenses are taken to move, before anything is known.
+_MOVING = 0.2
 # Share of its price that must be in sight before a camera is fitted again for two groups alone.
 _PROMISED = 0.7
 # Two values that gain a smaller share of what a spread of values does are not tried: where two cameras were true they
@@ -125,6 +127,21 @@ class _ByView(NamedTuple):
         K, g = self.joint()
         K = K[:, own][..., own]
         return float((g[:, own].square().sum() - torch.einsum("vava->", K)) / (math.sqrt(2.0) * K.norm()))
+
+    def later(self, most: Tensor) -> Tensor:
+        """(3,) root of the mean square of θ in views to come, by all deviations up to `most` (3,) and their evidence.
+
+        So it has room for the error of the likeliest deviation, and for a lens that moves though that is not proven.
+        Zeros where the evidence is against it.
+        """
+        K, g = self.joint()
+        values, vectors = torch.linalg.eigh(torch.einsum("vawb,a,b->vawb", K, most, most).flatten(2).flatten(0, 1))
+        squares, pull = 4.0 ** -torch.arange(0.0, 6.5, 0.5, dtype=K.dtype), vectors.T @ (most * g).flatten()
+        times = squares[:, None] * values.clamp_min(0.0)
+        nats = 0.5 * (squares[:, None] * pull.square() / (1.0 + times) - times.log1p()).sum(1)
+        odds = math.log(_MOVING / (1.0 - _MOVING) / len(squares))
+        likely = torch.cat([nats.new_zeros(1), odds + nats]).softmax(0)
+        return most * (likely[1:] @ squares).sqrt() * (likely[0] < 1.0 - _MOVING)
 
     def total(self, theta: Tensor) -> Tensor:
         """(...) the change of χ² by θ (..., V, 3)."""
@@ -323,7 +340,7 @@ def lenses_by_view(
             fit = fit_by_options(seen, pixels, None, None, own, progress)
         found = own_lenses(fit, seen, pixels, own, progress, theta)
         strays, wrong = stray_corners(fit.residuals), list[Finding]()
-        if found is not None and bool(strays.any()):
+        if found is not None and found.nats and bool(strays.any()):
             wrong = outlier_findings(seen.names, fit.residuals, strays)
             # One wrong corner would make two cameras of the views.
             progress("again without corners that noise cannot explain")
@@ -331,7 +348,7 @@ def lenses_by_view(
             found = own_lenses(fit_by_options(seen, pixels, weights, fit, own, progress), seen, pixels, own, progress)
     except (InputError, DegenerateError, ArithmeticError, torch.linalg.LinAlgError):
         return result
-    if found is None:
+    if found is None or (result.hybrid is None and not found.nats):
         return result
     text, groups = f"{found.what} ({found.nats:.0f} nats)", found.groups
     if groups is not None:
@@ -348,11 +365,12 @@ def lenses_by_view(
     except DegenerateError as error:
         raise DegenerateError(f"{text}, which leaves no focal length for all of them: {_STILL}") from error
     text += ": the camera is their mean, and its error bars contain the movement"
-    moving = Finding("moving-lens", "doubt", text, f"for smaller ones {_STILL}")
+    moving = [Finding("moving-lens", "doubt", text, f"for smaller ones {_STILL}")] if found.nats else []
     return dataclasses.replace(
         after,
-        by_view=among(found.theta, used, len(result.observations.views)),
-        findings=(*lasting_findings(result), moving, *wrong, *after.findings),
+        by_view=among(found.theta, used, len(result.observations.views)) if moving else None,
+        moves=tuple(found.sigma.tolist()) if moving else (),
+        findings=(*lasting_findings(result), *moving, *wrong, *after.findings),
         rejected_corners=result.rejected_corners,
         rejected_views=result.rejected_views,
     )
@@ -368,6 +386,8 @@ def own_lenses(
 ) -> OwnLenses | None:
     """Scale and principal point of each view; None if all views have the same, or where nothing tells.
 
+    A lens that moves though that is not proven has zeros and no nats.
+
     Args:
         fit: of all of them as one camera.
         seen: the views.
@@ -379,8 +399,13 @@ def own_lenses(
     views = _of_fit(fit, pixels, torch.zeros_like(pixels[:, 0, :1]).expand(-1, _SIZE))
     if not bool(views.N.isfinite().all() and views.g.isfinite().all()):
         return None
-    refits, about, normal, nats = _Refits(fit, seen, pixels, options, progress), views.lens(), None, 0.0
-    spreads = max(about.score(own) for own in ([0], [1, 2])) > _ASKED
+    refits, about, nats = _Refits(fit, seen, pixels, options, progress), views.lens(), 0.0
+    by_scale, by_center = (about.score(own) for own in ([0], [1, 2]))
+    sigma, still, normal = about.begin * about.begin.new_tensor([0.0, 1.0, 1.0]), refits.theta, None
+    # Far below what is asked for, no movement is likelier than none.
+    if 2.0 * by_center > _ASKED and bool((sigma := about.later(sigma)).any()):
+        normal = OwnLenses(fit=_widened(fit, pixels, still, sigma), sigma=sigma, theta=still, nats=0.0)
+    spreads = max(by_scale, by_center) > _ASKED
     if spreads:
         found, none, bent = _likeliest(views, _LENS), views.spread(_NONE), views.spread(_BENT)
         if bent.beyond(none) >= 0.0 and bent.nats > found.nats:
@@ -391,9 +416,9 @@ def own_lenses(
         held = views.lens(_LESS)
         second = _grouped(held, held.spread(_LENS[-1]).mean, fit.size)
         if not _FEWEST_OTHERS <= int(second.sum()) <= len(second) - _FEWEST_OTHERS:
-            return None
+            return normal
         if about.best(second)[2] < _PROMISED * _parted(about, second, fit.size)[2]:
-            return None
+            return normal
     else:
         for turn in range(_ROUNDS):
             views = refits.with_own(found.mean[:, :_SIZE] if turn or theta is None else theta)
@@ -405,7 +430,9 @@ def own_lenses(
         nats = found.nats + refits.nats(about)
         second = _grouped(about, found.mean, fit.size)
         if nats >= _SURE:
-            normal = OwnLenses(fit=refits.widened(found.sigma), sigma=found.sigma, theta=refits.theta, nats=nats)
+            # About the likeliest ones, no more than these are thinkable.
+            sigma = about.later(8.0 * found.sigma[:_SIZE])
+            normal = OwnLenses(fit=refits.widened(sigma), sigma=sigma, theta=refits.theta, nats=nats)
             if about.best(second)[2] < _BEHIND * found.nats:
                 return normal
     return _two_cameras(refits, about, second, max(nats, 0.0)) or normal
@@ -567,22 +594,16 @@ def _widened(fit: HybridFit, pixels: Tensor, theta: Tensor, sigma: Tensor) -> Hy
     prior[:, -1] = weight * theta[:, moves]
     rows = torch.cat([rows[:, :local], own, rows[:, local:]], 1)
     off = without_local(torch.cat([rows, prior], 2), local + len(weight)).transpose(0, 1).flatten(1).T
-    # Those of the information, and the camera's own movement, which is that of the next view, in front.
+    # Those of the information; then the movement of the next view.
     columns = [0] * known.lens_size
     for index, slot in zip(unknowns.indices, unknowns.slots, strict=True):
         if known.slots[index] >= 0:
             columns[known.slots[index]] = slot
     columns += range(len(unknowns), len(unknowns) + known.board_size)
     data = triangular(off[:, [*columns, -1]]) / (fit.sigma * math.sqrt(fit.wider))
-    change = data.new_zeros(len(columns), _SIZE)
-    change[[known.slots[0], known.slots[1]], 0] = torch.stack([fx, fy])
-    change[known.slots[2], 1] = change[known.slots[3], 2] = 1.0
-    moved = data[:, :-1] @ change[:, moves]
-    rows = torch.cat(
-        [torch.cat([-moved, data], 1), torch.nn.functional.pad(torch.diag(1.0 / sigma[moves]), (0, data.shape[1]))]
-    )
-    rows = triangular(rows)[len(weight) : -1, len(weight) :]
-    known = dataclasses.replace(known, rows=rows[:, :-1], residuals=rows[:, -1])
+    change = data.new_zeros(len(known.slots), _SIZE)
+    change[:2, 0], change[2, 1], change[3, 2] = torch.stack([fx, fy]), 1.0, 1.0
+    known = dataclasses.replace(known, rows=data[:, :-1], residuals=data[:, -1]).changed(change * sigma)
     half = torch.zeros_like(fit.half)
     half[: len(columns), columns] = known.half()
     return dataclasses.replace(fit, information=known, half=half)

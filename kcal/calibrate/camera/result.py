@@ -313,6 +313,7 @@ class CameraCalibrationResult(ArrowRows):
         rejected_views: views left out likewise, and copies of other views.
         by_view: (V, 3) logarithm of the scale, and principal point (pixels), of each view off those of the camera, if
             a stabilizer or an autofocus moves the lens; None: all views have the same.
+        moves: standard deviations of these, with room for their own errors, as `CalibrationRecord` says them.
         without: what the options left out of a hybrid lens, as `CalibrationRecord` says it.
         shared_board: which cameras helped to measure the board, where several were calibrated together. Errors of such
             cameras are not quite independent of each other; a rig of them knows that.
@@ -343,6 +344,7 @@ class CameraCalibrationResult(ArrowRows):
     rejected_corners: tuple[Rejected, ...] = ()
     rejected_views: tuple[Rejected, ...] = ()
     by_view: Tensor | None = None
+    moves: tuple[float, ...] = ()
     without: tuple[str, ...] = ()
     shared_board: SharedBoard | None = None
 
@@ -385,6 +387,7 @@ class CameraCalibrationResult(ArrowRows):
             tempering=None if self.hybrid is None else self.hybrid.tempering,
             board_deviation=None if moved is None else tuple((x, y, z) for x, y, z in moved),
             without=self.without,
+            moves=self.moves,
             warnings=self.warnings,
             **provenance(),
         )

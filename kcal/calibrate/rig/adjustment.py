@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -228,10 +229,11 @@ class Adjustment:
             camera = self.data.cameras[c]
             reads = camera.model.hybrid or camera.calibration is None
             columns, reach = block.motion_columns(c, posed[c], state, reads=reads)
-            found = self.motion[c] = board_motion(columns, block.weighted(c, columns), reach, rig, c)
+            weighted, focal = functools.partial(block.weighted, c), float(camera.params[0])
+            found = self.motion[c] = board_motion(columns, weighted, focal, reach, rig, c)
             if found is not None:
                 before[c] = rig.parts[c].rows
-                rig.put(c, WithoutMotion(block.weighted(c, found.columns))(before[c]))
+                rig.put(c, WithoutMotion(weighted(found.columns))(before[c]))
 
     def fit_corners(self, mask: Tensor, *, robust: bool = False) -> float:
         """Set the corners' sigma from the boards' residuals, unless it was given.

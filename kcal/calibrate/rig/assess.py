@@ -28,7 +28,7 @@ from kcal.lens.calibration import CameraCalibration
 from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
 from kcal.solve.lm import LMOptions, Result, SolverStatus
-from kcal.texts import counted_text, length_text
+from kcal.texts import counted_text, length_text, number_text
 
 # Refuse rigs whose baseline is so open that intervals of ranges are wrong; widen intervals where that helps.
 #
@@ -508,10 +508,11 @@ def rig_result(
     doubts += [] if doubts else more
     refuse_several(work, mask)
     against = contradicting_source(work, solution, refuse=refuse)
+    moving = widen_for_lenses(work, solution)
     told = records(work, mask, reasons)
     rms = math.sqrt(float(told.squared.sum() / told.counts.sum()))
     status = SolverStatus(int(found.status))
-    findings += [*sigmas_findings(work, fit), *apart, *against]
+    findings += [*sigmas_findings(work, fit), *apart, *against, *moving]
 
     def doubt(name: str, text: str, action: str = "") -> None:
         findings.append(Finding(name, "doubt", text, action))
@@ -572,6 +573,32 @@ def rig_result(
         _places=places(work),
         _provenance={**provenance(), "lens_change": lens_change},
     )
+
+
+def widen_for_lenses(work: Adjustment, solution: RigSolution) -> list[Finding]:
+    """Widen the covariance for lenses that move from view to view: later frames are others than those of the rig.
+
+    Their calibrations tell by how much, or pairs of boards. An image that is shifted is one of a camera that turned.
+    """
+    told, rotation = list[Finding](), solution.state.rotation
+    for c, (name, camera, motion) in enumerate(zip(work.data.names, work.data.cameras, work.motion, strict=True)):
+        record, image = camera.calibration and camera.calibration.record, motion.image if motion else 0.0
+        scale, *center = record.moves if record and record.moves else (0.0, 0.0, 0.0)
+        if not any((scale, *center, image)):
+            continue
+        focal = camera.params[:2].detach()
+        right, down = (max(each, image) / length for each, length in zip(center, focal.tolist(), strict=True))
+        turns = rotation.new_tensor([[0.0, down], [right, 0.0], [0.0, 0.0]])
+        # The frame of a rig may be that of the camera: the others turn, then.
+        turning = [c] if solution.problem.turn[c] is not None else range(len(rotation))
+        shifts = sum(solution.turn_rows(k).T @ (rotation[k] @ rotation[c].T @ turns) for k in turning)
+        longer = torch.linalg.pinv(solution.parameter_rows(c))[:, :2] @ (scale * focal[:, None])
+        solution.root = torch.cat([solution.root, shifts, longer], 1)
+        how = f"by some {number_text(image, digits=2)} px as pairs show" if image else "as its calibration found"
+        text = f"the lens of {name} moves from view to view, {how}: error bars contain the movement of later frames"
+        action = "for smaller ones switch the image stabilizer off, lock focus and zoom, and photograph again"
+        told.append(Finding("moving-lens", "doubt", text, action))
+    return told
 
 
 def _refined(camera: Camera, parameters: Tensor, covariance: Tensor) -> Camera:

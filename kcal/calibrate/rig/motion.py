@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from kcal.calibrate.hybrid.evidence import (
     ViewData,
     evidence_of_motion,
     expected_maximum,
+    loss_at,
     maximize_evidence,
 )
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
@@ -94,21 +95,39 @@ class BoardMotion(NamedTuple):
         sigma: standard deviations of motions while rows are read.
         apart: of turns and shifts between the exposures, in the same units.
         reach: of the board about its middle, distances of the board.
+        image: pixels by which a stabilizer shifts the image of each view along each axis, in place of `apart`.
     """
 
     columns: Tensor
     sigma: MotionSigma
     apart: tuple[float, float]
     reach: float
+    image: float
 
 
-def board_motion(columns: Tensor, white: Tensor, reach: float, rig: RigRows, camera: int) -> BoardMotion | None:
+class _Way(NamedTuple):
+    """One way to explain what boards that stand still leave, by its amplitudes; `nats` by which it is likelier."""
+
+    columns: Tensor
+    white: Tensor
+    data: ViewData
+    families: PriorFamilies
+    best: Amplitudes
+    nats: float
+
+
+def board_motion(
+    columns: Tensor, weighted: Callable[[Tensor], Tensor], focal: float, reach: float, rig: RigRows, camera: int
+) -> BoardMotion | None:
     """Estimate how boards move while a camera reads its rows, and between exposures; None where they stand still.
+
+    What differs from exposure to exposure is a motion of the boards, or a shift of the image, whichever is likelier.
 
     Args:
         columns: (V, 18, 2, N) derivatives of its pixels by motions; (V, 6, 2, N) if they do not move while rows are
             read.
-        white: (V, 18, R) or (V, 6, R) the same of the rows of the camera, in standard deviations of their residuals.
+        weighted: makes of such derivatives those (V, M, R) of the camera's rows, in standard deviations of residuals.
+        focal: length of the camera, pixels.
         reach: of the board about its middle, distances of the board.
         rig: rows of all cameras, other cameras' motions integrated out.
         camera: its number.
@@ -120,11 +139,14 @@ def board_motion(columns: Tensor, white: Tensor, reach: float, rig: RigRows, cam
     # Residuals without noise need no motion to explain them.
     if variance < _EXACT:
         return None
-    data, families = rig.told(camera, white)
-    begin = np.full(columns.shape[1] // AXES, math.log(MEDIAN) - 0.5 * math.log(variance))
-    best = maximize_evidence(data, families, Amplitudes(_NONE, variance, begin), _NO_PRIOR)
-    if evidence_of_motion(data, best, families, 1.0) < WORTH:
+    way = _likeliest(columns, weighted(columns), rig, camera)
+    if evidence_of_motion(way.data, way.best, way.families, 1.0) < WORTH:
         return None
+    shifts = torch.cat([columns[:, :-_POSE], torch.zeros_like(columns[:, -_POSE:])], 1)
+    shifts[:, -3, 0] = shifts[:, -2, 1] = APART * focal
+    other = _likeliest(shifts, weighted(shifts), rig, camera)
+    by_image = other.nats > way.nats + WORTH
+    columns, white, data, families, best, _ = other if by_image else way
     # Motion that a single board shows is an error of that board.
     explained = data.integrated(best.log_ratio).half[..., -1].square().sum(-1)
     others = rig.without(int(good.nonzero()[explained.argmax(), 0]))
@@ -137,9 +159,19 @@ def board_motion(columns: Tensor, white: Tensor, reach: float, rig: RigRows, cam
     return BoardMotion(
         columns * each[:, None, None],
         MotionSigma(*sigma or (0.0,) * AMPLITUDES),
-        (APART * turn, APART * shift),
+        (0.0, 0.0) if by_image else (APART * turn, APART * shift),
         reach,
+        APART * focal * shift * by_image,
     )
+
+
+def _likeliest(columns: Tensor, white: Tensor, rig: RigRows, camera: int) -> _Way:
+    """The amplitudes of largest evidence."""
+    data, families = rig.told(camera, white)
+    begin = np.full(columns.shape[1] // AXES, math.log(MEDIAN) - 0.5 * math.log(rig.variance))
+    best = maximize_evidence(data, families, Amplitudes(_NONE, rig.variance, begin), _NO_PRIOR)
+    still = loss_at(data.only([]), best._replace(log_ratio=begin[:0], variance=rig.variance), families, 1.0)
+    return _Way(columns, white, data, families, best, still - loss_at(data, best, families, 1.0))
 
 
 class RigRows:

@@ -245,6 +245,14 @@ def test_amplitudes_from_quadratic_forms() -> None:
     torch.testing.assert_close(center.sigma, true, rtol=0.06, atol=0.0)
     assert max(still.spread(tied).nats for tied in module._LENS) < 0.0
     assert views.score([1, 2]) > 10.0 * abs(still.score([1, 2]))
+    # Twelve views leave room for the error of their deviation, as Student's t does; two hundred still ones for nothing.
+    none, each = views.b[:12, :0], 0.06 * (theta[:12] - theta[:12].mean(0)) + 0.25 * normal(12, 3)
+    few = module._ByView(
+        0.06 * torch.eye(3).double().expand(12, 3, 3), -each, none[:, None].expand(12, 3, 0), none, (), begin
+    )
+    likely = few.spread(module._LENS[0]).sigma
+    assert 1.02 < float(few.later(8.0 * likely)[1] / likely[1]) < 1.1
+    assert not bool(still.later(torch.tensor([0.0, 30.0, 30.0], dtype=torch.float64)).any())
     theta = theta - theta.mean(0)
     at, before = views.b.sum(0) + (views.C.mT @ theta[..., None])[..., 0].sum(0), views.b.sum(0)
     fixed = (theta * (2.0 * views.g + (views.N @ theta[..., None])[..., 0])).sum()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import datetime
 import functools
 import math
 from pathlib import Path
@@ -22,6 +23,7 @@ from kcal.calibrate.rig.source import Context, PosedCamera, RigState, as_items
 from kcal.calibrate.rig.sources import Boards
 from kcal.calibrate.rig.unknowns import held
 from kcal.lens import CameraCalibration
+from kcal.lens.calibration import CalibrationRecord
 from kcal.lens.pose import Pose, rotation_from_vector, vector_from_rotation
 from kcal.rig import pair_by_name
 from kcal.sim.captures import BoardSize, sample_board_poses
@@ -182,8 +184,10 @@ def test_before_a_lens_that_is_calibrated_with_few_coefficients_only_pairs_scatt
     assert math.isfinite(found.rms)
 
 
-def taken_apart(seed: int, turn: float, *, later: int = 0, bump: float = 0.0) -> RigResult:
+def taken_apart(seed: int, turn: float, *, later: int = 0, bump: float = 0.0, shift: float = 0.0) -> RigResult:
     """A rig whose boards turn, and move by as much, in between; the second half of the pairs after a bump.
+
+    A stabilizer shifts the right camera's images by so many pixels.
 
     Views of the right camera are paired with those that the left one took `later`.
     """
@@ -200,7 +204,7 @@ def taken_apart(seed: int, turn: float, *, later: int = 0, bump: float = 0.0) ->
         moving_capture(CAMERA, own, sigma=0.1, seed=2 * seed + k, board=SIZE).pixels
         for k, own in enumerate((poses, right))
     ]
-    sides[1] = sides[1].roll(later, 0)
+    sides[1] = sides[1].roll(later, 0) + shift * torch.randn(len(poses), 1, 2, generator=random, dtype=F64)
     seen = [torch.where((CAMERA.inside(own) & own.isfinite().all(-1))[..., None], own, torch.nan) for own in sides]
     kept = (torch.stack(seen).isfinite().all(-1).sum(-1) >= 12).all(0).nonzero()[:, 0].tolist()
     names = [f"{i:02d}" for i in kept]
@@ -218,10 +222,40 @@ def test_pairs_that_were_not_taken_at_one_moment_scatter(turn: float) -> None:
         text = result.warnings[0]
         assert "were both views of each pair taken at the same moment" in text
         assert 0.4 < float(text.split("by some ")[1].split(" px")[0]) / (1000 * turn) < 2.5
-        assert not any("moved while rows were read" in one for one in result.warnings)
+        assert not any("moved while rows were read" in one or "lens" in one for one in result.warnings)
         assert result.sigma_corner == pytest.approx(0.1, rel=0.3)
         # Of a dozen pairs, each is off by as much.
         assert 0.15 * turn < result.relative_covariance()[:3, :3].diagonal().max().sqrt() < turn
+
+
+@pytest.mark.slow
+def test_images_that_a_stabilizer_shifts() -> None:
+    """They are told from boards that moved, and error bars contain the shift of the next frame."""
+    for result in (taken_apart(seed, 0.0, shift=3.0) for seed in range(2)):
+        assert [finding.name for finding in result.findings] == ["moving-lens"]
+        shift = float(result.warnings[0].split("by some ")[1].split(" px")[0])
+        assert 1.8 < shift < 5.0
+        sigma = result.relative_covariance().diagonal().sqrt()
+        assert shift / 1100 < float(sigma[:2].min())
+        assert float(sigma[:2].max()) < 1.3 * shift / 1100
+
+
+def test_a_lens_whose_calibration_says_that_it_moves() -> None:
+    record = CalibrationRecord(
+        rms=0.1, views=1, points=9, per_view_rms={"a": 0.1}, board=BOARD.record, stop_reason="", iterations=1,
+        moves=(0.01, 5.0, 7.0), kcal_version="", created=datetime.datetime.now(datetime.UTC),
+    )  # fmt: skip
+    cameras = [CAMERA.with_parameters(CAMERA.params.detach() + 1e-9 * c) for c in range(2)]
+    for camera in cameras:
+        known = 1e-6 * torch.eye(len(CAMERA.params), dtype=F64)
+        camera.calibration = CameraCalibration(covariance=known, record=record)
+    seen = captured(False, 0)
+    found = calibrate_rig(*cameras, *seen, [(name, name) for name in seen[0].names])
+    assert [finding.name for finding in found.findings] == ["moving-lens"] * 2
+    # Of both cameras: shifts to the right are turns about the axis that points down.
+    expected = math.sqrt(2.0) * torch.tensor([7.0, 5.0], dtype=F64) / 1100
+    torch.testing.assert_close(found.relative_covariance().diagonal()[:2].sqrt(), expected, rtol=0.05, atol=0.0)
+    assert found.stereo().left.calibration.sigma["fx"] == pytest.approx(11.0, rel=0.02)
 
 
 def test_views_that_are_paired_with_those_of_other_moments_are_refused() -> None:
