@@ -401,10 +401,10 @@ def own_lenses(
         return None
     refits, about, nats = _Refits(fit, seen, pixels, options, progress), views.lens(), 0.0
     by_scale, by_center = (about.score(own) for own in ([0], [1, 2]))
-    sigma, still, normal = about.begin * about.begin.new_tensor([0.0, 1.0, 1.0]), refits.theta, None
+    sigma, normal = about.begin * about.begin.new_tensor([0.0, 1.0, 1.0]), None
     # Far below what is asked for, no movement is likelier than none.
     if 2.0 * by_center > _ASKED and bool((sigma := about.later(sigma)).any()):
-        normal = OwnLenses(fit=_widened(fit, pixels, still, sigma), sigma=sigma, theta=still, nats=0.0)
+        normal = OwnLenses(fit=_for_later(fit, sigma), sigma=sigma, theta=refits.theta, nats=0.0)
     spreads = max(by_scale, by_center) > _ASKED
     if spreads:
         found, none, bent = _likeliest(views, _LENS), views.spread(_NONE), views.spread(_BENT)
@@ -579,7 +579,6 @@ def _mirrored(change: Tensor, covariance: Tensor, place: Tensor, fit: HybridFit)
 
 def _widened(fit: HybridFit, pixels: Tensor, theta: Tensor, sigma: Tensor) -> HybridFit:
     """A fit of pixels from which θ was taken away, with error bars that allow for it, and for that of the next view."""
-    known = fit.information
     unknowns = hybrid_unknowns(fit.model, fit.square)
     problem = _problem(fit, pixels, unknowns, fit.board_shapes.shapes)
     rows, local = problem.rows(fit.state._replace(board=torch.zeros_like(fit.state.board))), problem.local_size
@@ -594,19 +593,28 @@ def _widened(fit: HybridFit, pixels: Tensor, theta: Tensor, sigma: Tensor) -> Hy
     prior[:, -1] = weight * theta[:, moves]
     rows = torch.cat([rows[:, :local], own, rows[:, local:]], 1)
     off = without_local(torch.cat([rows, prior], 2), local + len(weight)).transpose(0, 1).flatten(1).T
-    # Those of the information; then the movement of the next view.
+    data = triangular(off[:, [*_known(fit), -1]]) / (fit.sigma * math.sqrt(fit.wider))
+    known = dataclasses.replace(fit.information, rows=data[:, :-1], residuals=data[:, -1])
+    return _for_later(dataclasses.replace(fit, information=known), sigma)
+
+
+def _for_later(fit: HybridFit, sigma: Tensor) -> HybridFit:
+    """A fit with error bars that allow for θ of the next view, whose standard deviations (3,) these are."""
+    change, half, columns = sigma.new_zeros(len(fit.information.slots), _SIZE), torch.zeros_like(fit.half), _known(fit)
+    change[:2, 0], change[2, 1], change[3, 2] = fit.state.parameters[:2], 1.0, 1.0
+    known = fit.information.changed(change * sigma)
+    half[: len(columns), columns] = known.half()
+    return dataclasses.replace(fit, information=known, half=half)
+
+
+def _known(fit: HybridFit) -> list[int]:
+    """Which of a fit's unknowns those of its information are."""
+    known, unknowns = fit.information, hybrid_unknowns(fit.model, fit.square)
     columns = [0] * known.lens_size
     for index, slot in zip(unknowns.indices, unknowns.slots, strict=True):
         if known.slots[index] >= 0:
             columns[known.slots[index]] = slot
-    columns += range(len(unknowns), len(unknowns) + known.board_size)
-    data = triangular(off[:, [*columns, -1]]) / (fit.sigma * math.sqrt(fit.wider))
-    change = data.new_zeros(len(known.slots), _SIZE)
-    change[:2, 0], change[2, 1], change[3, 2] = torch.stack([fx, fy]), 1.0, 1.0
-    known = dataclasses.replace(known, rows=data[:, :-1], residuals=data[:, -1]).changed(change * sigma)
-    half = torch.zeros_like(fit.half)
-    half[: len(columns), columns] = known.half()
-    return dataclasses.replace(fit, information=known, half=half)
+    return [*columns, *range(len(unknowns), len(unknowns) + known.board_size)]
 
 
 def _problem(fit: HybridFit, pixels: Tensor, free: FreeParameters | Sequence[int], shapes: Tensor) -> BoardProblem:

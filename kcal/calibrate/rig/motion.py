@@ -105,17 +105,6 @@ class BoardMotion(NamedTuple):
     image: float
 
 
-class _Way(NamedTuple):
-    """One way to explain what boards that stand still leave, by its amplitudes; `nats` by which it is likelier."""
-
-    columns: Tensor
-    white: Tensor
-    data: ViewData
-    families: PriorFamilies
-    best: Amplitudes
-    nats: float
-
-
 def board_motion(
     columns: Tensor, weighted: Callable[[Tensor], Tensor], focal: float, reach: float, rig: RigRows, camera: int
 ) -> BoardMotion | None:
@@ -139,14 +128,16 @@ def board_motion(
     # Residuals without noise need no motion to explain them.
     if variance < _EXACT:
         return None
-    way = _likeliest(columns, weighted(columns), rig, camera)
-    if evidence_of_motion(way.data, way.best, way.families, 1.0) < WORTH:
+    white = weighted(columns)
+    data, families, best, _ = found = _likeliest(white, rig, camera)
+    if evidence_of_motion(data, best, families, 1.0) < WORTH:
         return None
     shifts = torch.cat([columns[:, :-_POSE], torch.zeros_like(columns[:, -_POSE:])], 1)
     shifts[:, -3, 0] = shifts[:, -2, 1] = APART * focal
-    other = _likeliest(shifts, weighted(shifts), rig, camera)
-    by_image = other.nats > way.nats + WORTH
-    columns, white, data, families, best, _ = other if by_image else way
+    other = _likeliest(weighted(shifts), rig, camera)
+    if by_image := other[-1] > found[-1] + WORTH:
+        columns, white, found = shifts, weighted(shifts), other
+    data, families, best, _ = found
     # Motion that a single board shows is an error of that board.
     explained = data.integrated(best.log_ratio).half[..., -1].square().sum(-1)
     others = rig.without(int(good.nonzero()[explained.argmax(), 0]))
@@ -165,13 +156,13 @@ def board_motion(
     )
 
 
-def _likeliest(columns: Tensor, white: Tensor, rig: RigRows, camera: int) -> _Way:
-    """The amplitudes of largest evidence."""
+def _likeliest(white: Tensor, rig: RigRows, camera: int) -> tuple[ViewData, PriorFamilies, Amplitudes, float]:
+    """What the boards say of motions (V, M, R), the amplitudes of largest evidence, and nats gained over none."""
     data, families = rig.told(camera, white)
-    begin = np.full(columns.shape[1] // AXES, math.log(MEDIAN) - 0.5 * math.log(rig.variance))
+    begin = np.full(white.shape[1] // AXES, math.log(MEDIAN) - 0.5 * math.log(rig.variance))
     best = maximize_evidence(data, families, Amplitudes(_NONE, rig.variance, begin), _NO_PRIOR)
     still = loss_at(data.only([]), best._replace(log_ratio=begin[:0], variance=rig.variance), families, 1.0)
-    return _Way(columns, white, data, families, best, still - loss_at(data, best, families, 1.0))
+    return data, families, best, still - loss_at(data, best, families, 1.0)
 
 
 class RigRows:
@@ -350,8 +341,5 @@ def scatter_findings(focal: Sequence[float], motions: Sequence[BoardMotion | Non
         "of a corner: were both views of each pair taken at the same moment, of a board at rest? Each pair counts with "
         "such an error, and the covariance allows for it"
     )
-    action = (
-        "trigger the cameras together, or put the board on a stand (if nothing moved, a camera is wrong, or a "
-        "stabilizer shifts each image, and ranges of other frames err by as much: switch it off)"
-    )
+    action = "trigger the cameras together, or put the board on a stand (if nothing moved, a camera is wrong)"
     return [Finding("synchronization", "doubt", text, action)]
