@@ -88,7 +88,7 @@ class CameraFile(NativeFile):
 
     KIND: ClassVar[str] = "camera"
     VERSION: ClassVar[int] = 2
-    _LATER: ClassVar[Mapping[str, Any]] = {"setting": None, "calibration.without": (), "calibration.moves": ()}
+    _LATER: ClassVar[Mapping[str, Any]] = {"setting": None, "calibration.without": (), "calibration.moves": None}
 
     name: str
     image_size: ImageSize

@@ -109,8 +109,8 @@ class CalibrationRecord:
         observations: name of the observations file, if there was one.
         temperature: of the camera when the views were taken, °C; None if nobody said.
         without: what a hybrid lens was told not to estimate of the views: "motion", "bending".
-        moves: standard deviations by which its ln scale and principal point (px) differ from view to view; (): they
-            do not.
+        moves: standard deviations by which its ln scale and principal point (px) differ from view to view; None:
+            they do not.
         warnings: what should be doubted of it, a sentence each.
         kcal_version: the version that calibrated; see `kcal.io.camera_file.provenance`.
         created: when, with its time zone.
@@ -133,7 +133,7 @@ class CalibrationRecord:
     board_deviation: tuple[tuple[float, float, float], ...] | None = None
     temperature: float | None = None
     without: tuple[str, ...] = ()
-    moves: tuple[float, ...] = ()
+    moves: tuple[float, float, float] | None = None
     warnings: tuple[str, ...] = ()
     kcal_version: str
     created: datetime.datetime

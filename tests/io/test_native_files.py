@@ -103,13 +103,14 @@ class TestCamera:
         assert tuple(after.standard_deviations) == camera.names
 
     def test_what_was_left_out_is_kept_and_absent_elsewhere(self, tmp_path: Path, camera: Camera) -> None:
-        record = dataclasses.replace(camera_calibration(), without=("bending",))
+        record = dataclasses.replace(camera_calibration(), without=("bending",), moves=(0.0, 5.0, 4.0))
         save_camera(known(camera, record=record), tmp_path / "camera.json")
         calibration = load_camera(tmp_path / "camera.json").calibration
         assert calibration is not None
         assert calibration.record == record
         text = save_camera(known(camera, record=camera_calibration()), tmp_path / "camera.json").read_text()
         assert "without" not in text
+        assert "moves" not in text
 
     def test_covariance_round_trip(self, tmp_path: Path, camera: Camera) -> None:
         """By name, without what was held, to the last bit; and as a rig's covariance wants it."""

@@ -364,12 +364,13 @@ def lenses_by_view(
         after = hybrid_result(result.observations, found.fit.among(used, len(result.observations.views)), options)
     except DegenerateError as error:
         raise DegenerateError(f"{text}, which leaves no focal length for all of them: {_STILL}") from error
+    scale, right, down = found.sigma.tolist()
     text += ": the camera is their mean, and its error bars contain the movement"
     moving = [Finding("moving-lens", "doubt", text, f"for smaller ones {_STILL}")] if found.nats else []
     return dataclasses.replace(
         after,
         by_view=among(found.theta, used, len(result.observations.views)) if moving else None,
-        moves=tuple(found.sigma.tolist()) if moving else (),
+        moves=(scale, right, down) if moving else None,
         findings=(*lasting_findings(result), *moving, *wrong, *after.findings),
         rejected_corners=result.rejected_corners,
         rejected_views=result.rejected_views,
@@ -593,21 +594,25 @@ def _widened(fit: HybridFit, pixels: Tensor, theta: Tensor, sigma: Tensor) -> Hy
     prior[:, -1] = weight * theta[:, moves]
     rows = torch.cat([rows[:, :local], own, rows[:, local:]], 1)
     off = without_local(torch.cat([rows, prior], 2), local + len(weight)).transpose(0, 1).flatten(1).T
-    data = triangular(off[:, [*_known(fit), -1]]) / (fit.sigma * math.sqrt(fit.wider))
+    data = triangular(off[:, [*_of_information(fit), -1]]) / (fit.sigma * math.sqrt(fit.wider))
     known = dataclasses.replace(fit.information, rows=data[:, :-1], residuals=data[:, -1])
     return _for_later(dataclasses.replace(fit, information=known), sigma)
 
 
 def _for_later(fit: HybridFit, sigma: Tensor) -> HybridFit:
     """A fit with error bars that allow for θ of the next view, whose standard deviations (3,) these are."""
-    change, half, columns = sigma.new_zeros(len(fit.information.slots), _SIZE), torch.zeros_like(fit.half), _known(fit)
+    change, half, columns = (
+        sigma.new_zeros(len(fit.information.slots), _SIZE),
+        torch.zeros_like(fit.half),
+        _of_information(fit),
+    )
     change[:2, 0], change[2, 1], change[3, 2] = fit.state.parameters[:2], 1.0, 1.0
     known = fit.information.changed(change * sigma)
     half[: len(columns), columns] = known.half()
     return dataclasses.replace(fit, information=known, half=half)
 
 
-def _known(fit: HybridFit) -> list[int]:
+def _of_information(fit: HybridFit) -> list[int]:
     """Which of a fit's unknowns those of its information are."""
     known, unknowns = fit.information, hybrid_unknowns(fit.model, fit.square)
     columns = [0] * known.lens_size

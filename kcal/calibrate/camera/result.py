@@ -344,7 +344,7 @@ class CameraCalibrationResult(ArrowRows):
     rejected_corners: tuple[Rejected, ...] = ()
     rejected_views: tuple[Rejected, ...] = ()
     by_view: Tensor | None = None
-    moves: tuple[float, ...] = ()
+    moves: tuple[float, float, float] | None = None
     without: tuple[str, ...] = ()
     shared_board: SharedBoard | None = None
 

@@ -129,12 +129,12 @@ def board_motion(
     if variance < _EXACT:
         return None
     white = weighted(columns)
-    data, families, best, _ = found = _likeliest(white, rig, camera)
+    data, families, best, _ = found = _amplitudes(white, rig, camera)
     if evidence_of_motion(data, best, families, 1.0) < WORTH:
         return None
     shifts = torch.cat([columns[:, :-_POSE], torch.zeros_like(columns[:, -_POSE:])], 1)
     shifts[:, -3, 0] = shifts[:, -2, 1] = APART * focal
-    other = _likeliest(weighted(shifts), rig, camera)
+    other = _amplitudes(weighted(shifts), rig, camera)
     if by_image := other[-1] > found[-1] + WORTH:
         columns, white, found = shifts, weighted(shifts), other
     data, families, best, _ = found
@@ -156,7 +156,7 @@ def board_motion(
     )
 
 
-def _likeliest(white: Tensor, rig: RigRows, camera: int) -> tuple[ViewData, PriorFamilies, Amplitudes, float]:
+def _amplitudes(white: Tensor, rig: RigRows, camera: int) -> tuple[ViewData, PriorFamilies, Amplitudes, float]:
     """What the boards say of motions (V, M, R), the amplitudes of largest evidence, and nats gained over none."""
     data, families = rig.told(camera, white)
     begin = np.full(white.shape[1] // AXES, math.log(MEDIAN) - 0.5 * math.log(rig.variance))

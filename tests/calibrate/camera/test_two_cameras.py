@@ -163,6 +163,15 @@ class TestMoves:
         expected = torch.cat([true[:2] * math.exp(float(middle[0])), true[2:4] + middle[1:]])
         assert float(((params[:4] - expected).abs() / sigma[:4]).max()) < 2.5
 
+    @pytest.mark.slow
+    def test_what_is_not_proven_widens_error_bars_alone(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(module, "_SURE", math.inf)
+        result = calibrate_camera(moved(3, 0.0, 12.0)[0])
+        assert result.by_view is None
+        assert not any("lens moves" in text for text in result.warnings)
+        assert float(result.covariance[2, 2].sqrt()) > 0.7 * 12.0
+        torch.testing.assert_close(result.information.covariance(), result.covariance, rtol=1e-3, atol=1e-9)
+
     def test_a_parametric_lens_cannot(self) -> None:
         with pytest.raises(InputError, match="leave the model out, or lock focus"):
             calibrate_camera(moved(3, 0.0, 12.0)[0], CalibrationOptions(model="opencv5"))
