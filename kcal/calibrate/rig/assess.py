@@ -591,7 +591,7 @@ def widen_for_lenses(work: Adjustment, solution: RigSolution) -> list[Finding]:
         turns = rotation.new_tensor([[0.0, down], [right, 0.0], [0.0, 0.0]])
         # The frame of a rig may be that of the camera: the others turn, then.
         turning = [c] if solution.problem.turn[c] is not None else range(len(rotation))
-        shifts = sum(solution.turn_rows(k).T @ (rotation[k] @ rotation[c].T @ turns) for k in turning)
+        shifts = torch.stack([solution.turn_rows(k).T @ (rotation[k] @ rotation[c].T @ turns) for k in turning]).sum(0)
         longer = torch.linalg.pinv(solution.parameter_rows(c))[:, :2] @ (scale * focal[:, None])
         solution.root = torch.cat([solution.root, shifts, longer], 1)
         how = f"by some {number_text(image, digits=2)} px as pairs show" if image else "as its calibration found"
