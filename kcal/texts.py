@@ -140,11 +140,6 @@ def page_policy(*, scripts: Iterable[str] = (), styles: Iterable[str] = (), imag
     )
 
 
-def without_numbers(module: Any) -> bool:
-    """Whether a module is on the meta device, as models are that get their numbers later."""
-    return any(part.is_meta for part in (*module.parameters(), *module.buffers()))
-
-
 def brief(record: Any, **said: str) -> str:
     """The `repr` of a record in three lines at most: numbers and words first, then shapes of tensors and counts.
 
@@ -161,7 +156,7 @@ def brief(record: Any, **said: str) -> str:
     """
     kind = type(record)
     if hasattr(record, "named_children"):
-        if without_numbers(record):
+        if any(part.is_meta for part in (*record.parameters(), *record.buffers())):
             return f"{kind.__name__}(on the meta device)"
         children = (f"{name}={_brief_module(child)}" for name, child in record.named_children())
         return _in_lines(kind, [one for one in (record.extra_repr(), *children) if one])

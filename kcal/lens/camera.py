@@ -102,7 +102,17 @@ class Camera(ConvertibleCamera):
         return cls(torch.tensor(values, dtype=torch.float64), size=size, model=model)
 
     def with_parameters(self, parameters: Tensor) -> Camera:
-        """Make a camera of the same kind, size and model with other parameters; no memory is shared."""
+        """Make a camera of the same kind, size and model with other parameters; no memory is shared, nor gradients.
+
+        Parameters that something else computes get theirs by `torch.func.functional_call`:
+
+        Example:
+            >>> camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+            >>> params = (camera.params + 1.0).requires_grad_()
+            >>> pixels, _ = torch.func.functional_call(camera, {"params": params}, torch.tensor([[0.5, 0.0, 1.0]]))
+            >>> torch.autograd.grad(pixels[0, 0], params)[0].tolist()
+            [0.5, 0.0, 1.0, 0.0, 0.0]
+        """
         return Camera(parameters, size=self.size, model=self.model)
 
     @property

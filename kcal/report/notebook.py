@@ -23,7 +23,7 @@ from kcal.report.rig import rig_figure
 from kcal.report.shown import camera_blocks, derived_camera, observations_blocks, rig_blocks
 from kcal.report.tables import position_rows
 from kcal.report.verdict import Verdict
-from kcal.texts import page_text, without_numbers
+from kcal.texts import page_text
 
 # Positions that a notebook shows one by one.
 _MOST = 40
@@ -44,14 +44,13 @@ def html_of(record: object) -> str | None:
 
 @html_of.register
 def _camera_html(camera: Camera) -> str | None:
-    if camera.params.ndim > 1 or without_numbers(camera):
-        return None
-    return _html_of_blocks(camera_blocks(*derived_camera(camera)))
+    plain = camera.params.ndim == 1 and not camera.params.is_meta
+    return _html_of_blocks(camera_blocks(*derived_camera(camera))) if plain else None
 
 
 @html_of.register
 def _rig(rig: Rig) -> str | None:
-    return None if without_numbers(rig) else _html_of_blocks(rig_blocks(rig))
+    return None if rig.rotation.is_meta else _html_of_blocks(rig_blocks(rig))
 
 
 @html_of.register
