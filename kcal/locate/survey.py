@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 import xml.etree.ElementTree
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,7 +21,7 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import require_positive
 from kcal.calibrate.rig.sources import MeasuredPosition, RigData
-from kcal.errors import FileError, InputError, KcalError
+from kcal.errors import FileError, InputError, KcalError, KcalWarning
 from kcal.files import read_text
 from kcal.finding import Finding
 from kcal.lens.rig import Origin
@@ -116,11 +117,14 @@ def places_of(rows: Sequence[TableRow], path: str | Path, origin: Origin | None)
     whats = ["a number in meters" if column in (*LOCAL, "height") else "decimal degrees" for column in columns]
     values = torch.tensor([[*map(row.number, columns, whats)] for row in rows], dtype=torch.float64)
     if columns == LOCAL:
-        if origin and (farthest := float(values[:, :2].abs().amax())) > _PROJECTED:
-            raise FileError(
+        if (farthest := float(values[:, :2].abs().amax())) > _PROJECTED:
+            text = (
                 f"{path}: {length_text(farthest)} from the origin: east, north, up count from there. Convert UTM and "
                 "other projected coordinates to lat, lon, height (gdaltransform -s_srs EPSG:32612 -t_srs EPSG:4979)"
             )
+            if origin:
+                raise FileError(text)
+            warnings.warn(f"{text}; in a frame of your own they are flat and to the grid's scale", KcalWarning, 2)
         return values, origin
     _refuse_exchanged(rows, values)
     for row, (lat, lon, height) in zip(rows, values.tolist(), strict=True):

@@ -10,7 +10,7 @@ import pyproj
 import pytest
 import torch
 
-from kcal import FileError, InputError, Origin
+from kcal import FileError, InputError, KcalWarning, Origin
 from kcal.lens import rotation_from_vector
 from kcal.locate import enu_from_cam, enu_to_geodetic, read_marks
 from kcal.locate.marks import COVARIANCE
@@ -42,7 +42,8 @@ class TestSurvey:
 
     def test_projected_coordinates_are_no_local_meters(self, tmp_path: Path) -> None:
         path = write(tmp_path, "name,east,north,up,sigma\na,170000,400000,20,1\nb,170050,400030,21,1\n")
-        assert read_survey(path).points[0].tolist() == [170000, 400000, 20]
+        with pytest.warns(KcalWarning, match=r"400 km from the origin.*Convert UTM.*they are flat"):
+            assert read_survey(path).points[0].tolist() == [170000, 400000, 20]
         with pytest.raises(FileError, match=r"400 km from the origin.*Convert UTM"):
             read_survey(path, Origin(lat=3.6, lon=-78.0, height=0.0))
 
