@@ -64,7 +64,8 @@ def write_opencv(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -
     file = cv2.FileStorage(kind, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     if cameras[0].size != cameras[-1].size:
         raise InputError(
-            f"OpenCV's stereo file has one image size; these cameras have {cameras[0].size} and {cameras[-1].size}"
+            f"OpenCV's stereo file has one image size; these cameras have {cameras[0].size} and {cameras[-1].size}: "
+            "write each by itself (rig.json:left), or a format that has both, such as kalibr"
         )
     if cameras[0].model.fisheye != cameras[-1].model.fisheye:
         raise InputError("OpenCV's stereo file has two fisheyes or none: write the cameras one by one")
