@@ -76,34 +76,16 @@ def error_text(error: BaseException) -> str:
 
 
 # What the running command tells programs, if it was asked to.
-_told: dict[str, Any] = {}
-_as_json = False
+told: dict[str, Any] = {}
 
 
 def tell(**content: Any) -> None:
     """Add to what `--json` prints: plain numbers, texts, lists and dictionaries by name."""
-    _told.update(content)
-
-
-def tell_anew(as_json: bool) -> None:
-    """A command begins: forget what was told before."""
-    global _as_json
-    _as_json = as_json
-    _told.clear()
-
-
-def json_asked() -> bool:
-    """Whether what the command tells is printed as JSON, in place of what a person reads."""
-    return _as_json
-
-
-def told() -> dict[str, Any]:
-    """What was told since the command began."""
-    return _told
+    told.update(content)
 
 
 def _tell_more(name: str, *items: Any) -> None:
-    _told.setdefault(name, []).extend(items)
+    told.setdefault(name, []).extend(items)
 
 
 def warn(*texts: str) -> None:
@@ -123,7 +105,7 @@ def print_wrote(*paths: Path | None) -> None:
 
 def print_replaced(written: Mapping[Path, bool]) -> None:
     """Name on the error stream the files that were replaced and of which nothing was said."""
-    said = _told.get("wrote", ())
+    said = told.get("wrote", ())
     names = [str(path) for path, anew in written.items() if anew and str(path) not in said]
     if names:
         others = [f"{len(names) - 3} other files"] if len(names) > 3 else []

@@ -12,8 +12,8 @@ import typer
 
 import kcal
 from kcal.cli import console, kinds, rooms
-from kcal.cli.console import err, json_asked, out, print_table, print_wrote, steps, tell, warn
-from kcal.cli.inputs import pixel_sigma_and_source
+from kcal.cli.console import err, out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.inputs import pixel_sigma_and_source, typed
 from kcal.cli.options import Kind, Rare, settings_file, taken
 from kcal.errors import DegenerateError, InputError
 from kcal.files import written_files
@@ -273,7 +273,7 @@ def locate_command(
     outputs = output or []
     streamed = rooms.STREAM in outputs
     suffix = f".{format}"
-    if streamed and (json_asked() or outputs.count(rooms.STREAM) > 1):
+    if streamed and ("--json" in typed or outputs.count(rooms.STREAM) > 1):
         raise typer.BadParameter("-o - takes the standard output for itself; leave out --json and a second -o -")
     if streamed:
         console.end_line()

@@ -371,7 +371,7 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
 
     @functools.wraps(function)
     def run(*, as_json: bool = False, **given: Any) -> None:
-        console.tell_anew(as_json)
+        console.told.clear()
         if not as_json:
             return work(given)
         ended: Exception = typer.Exit(0)
@@ -380,7 +380,7 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
                 work(given)
             except (typer.Exit, *console.ERRORS) as stopped:
                 ended = stopped
-        told = {"exit_code": getattr(ended, "exit_code", 1), **console.told(), "text": captured.get().splitlines()}
+        told = {"exit_code": getattr(ended, "exit_code", 1), **console.told, "text": captured.get().splitlines()}
         if not isinstance(ended, typer.Exit):
             told["error"] = console.error_text(ended)
         console.end_line()

@@ -171,7 +171,7 @@ def solve_and_write(
     # Everything that can fail comes before the file.
     lines = rig_lines(result, rig, read.unpaired) if two else source_lines(result)
     left_out = {item.label: item.reason for item in result.left_out}
-    tell(rms_px=result.rms, warnings=console.told().get("warnings", []), left_out=left_out)
+    tell(rms_px=result.rms, warnings=console.told.get("warnings", []), left_out=left_out)
     print_rig(result, [*lines, *read.told(result)])
     kcal.save_rig(rig, output)
     if picture is not None:
