@@ -13,7 +13,7 @@ from torch import Tensor
 
 import kcal.calibrate.rig.explanations as explanations
 from kcal.calibrate.rig.adjustment import Adjustment
-from kcal.calibrate.rig.contradictions import contradicting_source, sigmas_findings, widen_for_parts
+from kcal.calibrate.rig.contradictions import contradicting_source, sigmas_findings, widen_for_fields
 from kcal.calibrate.rig.initial_poses import InitialPoses
 from kcal.calibrate.rig.marks import Features
 from kcal.calibrate.rig.motion import moved_findings, scatter_findings
@@ -503,7 +503,7 @@ def rig_result(
     widen, doubts = check_places(solution, data.names, refuse=refuse)
     if widen > 1.0:
         solution = RigSolution(problem, state, widen**2 * fit.variance)
-    apart = widen_for_parts(work, mask, solution)
+    apart = widen_for_fields(solution, data.names)
     more = check_poses(solution, data.names, refuse=refuse)
     doubts += [] if doubts else more
     refuse_several(work, mask)

@@ -7,7 +7,7 @@ it follows from products of the rows at the solution, without solving again.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, RigSolution, least
-from kcal.calibrate.rig.source import ItemSource, RigState
+from kcal.calibrate.rig.source import RigState
 from kcal.checks import beyond_chance, variance_factor
 from kcal.errors import ContradictionError
 from kcal.finding import Finding
@@ -105,204 +105,85 @@ def sigmas_findings(work: Adjustment, fit: GoodnessOfFit) -> list[Finding]:
     return [Finding("sigmas", "doubt", text) for text in texts]
 
 
-# Parts of a source that contradict the others of it.
+# Errors of pixels that neighbors share.
 #
-# An error of a lens, of matching or of a board that bends is alike for items that are near each other, so it does not
-# average out as noise does. Items are put into groups, by place in the image or by range, and each group may have an
-# offset of its own in one of the quantities that the rig shares: a random effect of variance τ².
+# A lens that is no longer what its calibration says, or matching that errs by place, moves what is near each other in
+# an image alike, so it does not average out as noise does, and parts of the image say different things of the cameras.
+# So each image may have a smooth field of errors beside all unknowns: a Gaussian process of variance τ² whose
+# correlation falls as exp(-d² / 2ℓ²) (Rasmussen and Williams 2006). All that a camera sees has the same field: what
+# matches and landmarks say of a lens counts once.
 #
-# No group is solved by itself. At the solution, the score of an offset of group g along the direction d is
-# u_g = dᵀ Σ B e over the rows B and residuals e of its items, and all scores together have the covariance
-# K = diag(dᵀ N_g d) - [dᵀ N_g] N⁻¹ [N_g d], with N_g the group's information and N that of everything (Rao 1948).
-# Offsets add τ² K K to it. In the eigenvectors of K each score is independent, and the evidence of τ² is a product.
-# The solution moves by N⁻¹ N_g d for each unit of a group's offset, which is what the covariance of the rig gains.
+# Nothing is solved again. With rows F of the field's amplitudes, B of the shared unknowns and residuals e at the
+# solution, the score Fᵀ e has the covariance K = Fᵀ F - Fᵀ B N⁻¹ Bᵀ F (Rao 1948); amplitudes of variance τ² add τ² K K
+# to it. The solution moves by -N⁻¹ Bᵀ F for each unit of an amplitude, so it is off by that times the amplitudes; the
+# second moments of these under all that is seen are what its covariance gains.
 #
-# The mean of the Bayes factors of all ways to make groups exceeds `_TOLD` in less than one of `_TOLD` good rigs, for
-# each direction, however many ways are tried (Markov's inequality). Below that nothing is widened:
-# `scripts/check/contradictions.py` measured that σ would grow by half without a reason.
+# The mean of the Bayes factors of all τ exceeds `_TOLD` in less than one of `_TOLD` good rigs (Markov's inequality), on
+# simulated ones in one of 500. Below that nothing is widened.
 
-# Items of a group, at least; groups along a line, and along each side of a grid, at most.
-_MEMBERS, _LINE, _SIDE = 5, 4, 3
-# τ² times the mean information about an offset: a quarter to 256, each power of two as likely.
-_RATIOS = 2.0 ** torch.arange(-2, 9, dtype=torch.float64)
-# Mean Bayes factor from which a contradiction is told, and its groups' offsets widen the covariance.
-_TOLD = 20.0
-# Information below this share of a group's is rounding.
-_ROUNDING = 1e-9
+# Of the images' sides, and how many places along them: closer ones add nothing to a field of that length.
+_LENGTH, _PLACES = 0.35, (5, 4)
+# τ² times the information about what is known best of a field: 1 to 4096, each power of four as likely.
+_RATIOS = 4.0 ** torch.arange(7, dtype=torch.float64)
+# Mean Bayes factor from which a field is told, and by how many times it then widens a turn at least.
+_TOLD, _MATTERS = 10.0, 1.1
 
 
-class _Direction(NamedTuple):
-    """Something that parts may disagree about: its words, its step (S,), and the function (S,) whose sigma is told."""
-
-    words: str
-    step: Tensor
-    row: Tensor
-    degrees: bool
-
-    def text(self, value: float) -> str:
-        """An amount of it."""
-        return f"{math.degrees(value):.2g}°" if self.degrees else f"{value:.2g} m"
+def _places(*counts: int) -> Tensor:
+    """(P, 2) places all over an image, whose sides are -½ and ½."""
+    across, down = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5 for count in counts)
+    return torch.cartesian_prod(across, down)
 
 
-class _Partition(NamedTuple):
-    """One way to put the items of a block into groups: the group (V,) of each, and a name for each group."""
-
-    block: int
-    kind: str
-    group: Tensor
-    names: tuple[str, ...]
-    cure: str
+def _smooth(places: Tensor) -> Tensor:
+    """(V, K) values at places (V, 2) of functions whose sum with standard normal amplitudes is a field of τ = 1."""
+    fixed = _places(*_PLACES)
+    among, there = (torch.exp(-0.5 * (torch.cdist(one, fixed) / _LENGTH) ** 2) for one in (fixed, places))
+    root = torch.linalg.cholesky(among + 1e-6 * torch.eye(len(fixed), dtype=torch.float64))
+    return torch.linalg.solve_triangular(root, there.T, upper=False).T
 
 
-class _Effect(NamedTuple):
-    """Evidence of offsets of a partition's groups along one direction.
-
-    Attributes:
-        factor: Bayes factor against no offsets.
-        tau: posterior mean of the offsets' standard deviation, if there are any.
-        worst: the group that stands out most.
-        offset: of it, from all together.
-        sigmas: how many of its standard deviations that is.
-        pull: (S, G) how the solution moves by an offset of each group.
-    """
-
-    factor: float
-    tau: float
-    worst: int
-    offset: float
-    sigmas: float
-    pull: Tensor
-
-
-def widen_for_parts(work: Adjustment, mask: Tensor, solution: RigSolution) -> list[Finding]:
-    """Compare parts of each source with the rest; widen the covariance for what they contradict, and tell of it."""
-    directions = _shared_directions(solution, work.data.names)
-    partitions = list(_partitions(work, mask, solution.state))
-    if not partitions or not directions:
+def widen_for_fields(solution: RigSolution, names: Sequence[str]) -> list[Finding]:
+    """Look for smooth errors in the images that no unknown explains; widen the covariance for them, and tell of it."""
+    size, variance = solution.problem.shared_size, solution.variance
+    products = solution.problem.field_products(solution.state, _smooth)
+    if len(products) == size + 1 or not bool(products.isfinite().all()):
         return []
-    onto = torch.block_diag(torch.stack([one.step for one in directions], 1), torch.ones(1, 1).double())
-    products, summed = solution.problem.item_products(solution.state, onto), []
-    for part in partitions:
-        own = products[part.block]
-        summed.append(own.new_zeros(len(part.names), *own.shape[1:]).index_add(0, part.group, own))
-    told, added = list[tuple[float, _Direction, _Partition, _Effect]](), list[Tensor]()
-    for axis, direction in enumerate(directions):
-        found = [_offsets_evidence(sums, axis, direction.step, solution) for sums in summed]
-        both = [(part, one) for part, one in zip(partitions, found, strict=True) if one is not None]
-        factor = sum(one.factor for _, one in both) / max(len(both), 1)
-        if factor < _TOLD:
-            continue
-        added += [math.sqrt(one.factor / len(both) / factor) * one.tau * one.pull for _, one in both]
-        told.append((factor, direction, *max(both, key=lambda one: one[1].factor)))
-    if not told:
-        return []
-    before = solution.root
-    solution.root = triangular(torch.cat([before, *added], 1).T).T
-    _, direction, part, one = max(told, key=lambda each: each[0])
-    old, new = (direction.text(float((direction.row @ root).norm())) for root in (before, solution.root))
-    text = (
-        f"{part.names[one.worst]} disagree with the other {part.kind} by {direction.text(one.offset)} in "
-        f"{direction.words} ({one.sigmas:.1f} sigma): its sigma was widened from {old} to {new}"
-    )
-    return [Finding("contradiction", "doubt", text, part.cure)]
-
-
-def _offsets_evidence(sums: Tensor, axis: int, step: Tensor, solution: RigSolution) -> _Effect | None:
-    """The evidence of offsets along a direction, by products (G, S + 1, Q + 1) of the groups; None without any."""
-    variance = solution.variance
+    own, right = products[size:-1, size:], products[:size, size:]
     inverse = solution.root / math.sqrt(variance)
-    along, score = sums[:, :-1, axis].T, sums[:, -1, axis]
-    known, thrown = step @ along, inverse.T @ along
-    K = torch.diag(known) - thrown.T @ thrown
+    pull = inverse @ (inverse.T @ right[:, :-1])
+    left = (own - pull.T @ right) / variance
+    K, score = left[:, :-1], left[:, -1]
     values, vectors = torch.linalg.eigh(K)
-    kept = values > _ROUNDING * known.max().clamp_min(1e-300)
-    if not bool(kept.any()):
-        return None
-    information = values[kept]
-    squares = (vectors[:, kept].T @ score).square() / information / variance
-    tau2 = _RATIOS / information.mean()
-    times = tau2[:, None] * information
-    logs = 0.5 * (squares * times / (1.0 + times) - times.log1p()).sum(1)
-    own = K.diagonal().clamp_min(_ROUNDING * known.max())
-    sigmas = score / (own * variance).sqrt()
-    worst = int(sigmas.abs().argmax())
-    return _Effect(
-        float(logs.exp().mean()),
-        math.sqrt(variance) * float(logs.softmax(0) @ tau2.sqrt()),
-        worst,
-        abs(float(score[worst] / own[worst])),
-        abs(float(sigmas[worst])),
-        inverse @ thrown,
+    known, along = values.clamp_min(0.0), vectors.T @ score
+    tau2 = (_RATIOS / known.max().clamp_min(1e-300))[:, None]
+    spread = tau2 / (1.0 + tau2 * known)
+    logs = 0.5 * (along.square() * spread - (tau2 * known).log1p()).sum(1)
+    if float(logs.exp().mean()) < _TOLD:
+        return []
+    weight, mean = logs.softmax(0)[:, None], -along * spread
+    # Second moments of the amplitudes under all τ.
+    root = torch.cat([torch.diag_embed((weight * spread).sum(0).sqrt()), weight.sqrt() * mean]) @ vectors.T
+    wider = triangular(torch.cat([solution.root, pull @ root.T], 1).T).T
+    cameras = range(1, len(names)) if len(names) > 1 else range(1)
+    turns = torch.cat([(solution.relative_rows(0, c) if c else solution.turn_rows(c))[:3] for c in cameras])
+    before, after = ((turns @ one).norm(dim=1) for one in (solution.root, wider))
+    worst = int((after / before).nan_to_num(0.0).argmax())
+    if float(after[worst]) <= _MATTERS * float(before[worst]):
+        return []
+    solution.root, step = wider, vectors @ (weight * mean).sum(0)
+    field = (_smooth(_places(3, 3)) @ step.unflatten(0, (len(names), -1, 2))).norm(dim=-1)
+    camera, place = divmod(int(field.argmax()), field.shape[1])
+    across, down = ("left", "middle", "right")[place // 3], ("upper ", "", "lower ")[place % 3]
+    moved, old, new = (math.degrees(float(one.abs()[worst])) for one in (turns @ pull @ step, before, after))
+    turn = f"the {('pitch', 'yaw', 'roll')[worst % 3]} of {names[cameras[worst // 3]]}"
+    text = (
+        f"what {names[camera]} sees in the {down}{across} of its image disagrees with the rest by "
+        f"{float(field.max()):.2g} px, and neighbors alike: it moves {turn} by {moved:.2g}°, whose sigma was widened "
+        f"from {old:.2g}° to {new:.2g}°"
     )
-
-
-def _shared_directions(solution: RigSolution, names: Sequence[str]) -> list[_Direction]:
-    """Turns of each camera about its axes, and its distance from the first."""
-    found, problem, center = list[_Direction](), solution.problem, solution.state.center
-    for c, name in enumerate(names):
-        if problem.turn[c] is not None:
-            words = zip(("pitch", "yaw", "roll"), solution.turn_rows(c), strict=True)
-            found += [_Direction(f"the {word} of {name}", turn, turn, True) for word, turn in words]
-        if c and problem.shift[c] is not None:
-            away = torch.nn.functional.normalize(center[c] - center[0], dim=0)
-            step = away @ solution.shift_rows(c)
-            row = step - away @ solution.shift_rows(0)
-            found.append(_Direction(f"the baseline of {name}", step, row, False))
-    return found
-
-
-def _partitions(work: Adjustment, mask: Tensor, state: RigState) -> Iterator[_Partition]:
-    """All ways to put items that took part into groups."""
-    used = [(source, at) for source, at in work.sources if bool(mask[at].any())]
-    for block, (source, at) in enumerate(used):
-        if source.least > 1:
-            # One wrong board among few is told otherwise, and would widen what the others say.
-            continue
-        chosen = mask[at]
-        yield from _by_place(block, source, work, chosen)
-        where = source.places(work.state.items[at], work.anchor)
-        if where is not None and (lines := min(_LINE, int(chosen.sum()) // _MEMBERS)) > 1:
-            far = (where[chosen] - state.center[0]).norm(dim=-1)
-            group, text = _ranked(far, lines), "check whether near ones moved, and what is known of their ranges"
-            ends = [(float(far[group == g].min()), float(far[group == g].max())) for g in range(lines)]
-            words = tuple(f"{source.kind} at {near:.3g} to {end:.3g} m" for near, end in ends)
-            yield _Partition(block, source.kind, group, words, text)
-
-
-def _by_place(block: int, source: ItemSource, work: Adjustment, chosen: Tensor) -> Iterator[_Partition]:
-    """Groups by columns, by rows and by a grid of the image of the first camera that sees each item."""
-    pixels = source.pixels[chosen]
-    spot = torch.full((len(pixels), 2), math.nan, dtype=torch.float64)
-    for c, camera in enumerate(work.data.cameras):
-        size = torch.tensor(camera.size, dtype=torch.float64)
-        spot = torch.where(spot.isnan(), (pixels[:, c] + 0.5) / size - 0.5, spot)
-    count, text = len(spot), "calibrate the lens with views that reach there, or leave these out"
-    lines, side = min(_LINE, count // _MEMBERS), min(_SIDE, math.isqrt(count // _MEMBERS))
-    ways = [_ranked(spot[:, 0], lines), _ranked(spot[:, 1], lines)] if lines > 1 else []
-    if side > 1:
-        columns = _ranked(spot[:, 0], side)
-        grid = columns * side
-        for column in range(side):
-            grid[columns == column] += _ranked(spot[columns == column, 1], side)
-        ways.append(grid)
-    for group in ways:
-        middles = [spot[group == g].mean(0).tolist() for g in range(int(group.max()) + 1)]
-        words = tuple(f"{source.kind} in the {_place_words(*middle)} of the image" for middle in middles)
-        yield _Partition(block, source.kind, group, words, text)
-
-
-def _ranked(values: Tensor, groups: int) -> Tensor:
-    """(V,) the group of each value, so that all have as many, in order."""
-    rank = values.argsort().argsort()
-    return rank * groups // max(len(values), 1)
-
-
-def _place_words(across: float, down: float) -> str:
-    """Where a place is in the image, whose sides are -½ and ½."""
-    third = 1.0 / 6.0
-    level = "left" if across < -third else "right" if across > third else ""
-    height = "upper" if down < -third else "lower" if down > third else ""
-    return f"{height} {level}".strip() if level else f"{height} middle".strip()
+    cure = "calibrate the lens with views that reach there, or check what was marked or matched there"
+    return [Finding("contradiction", "doubt", text, cure)]
 
 
 # A source that contradicts all the others.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -141,20 +141,36 @@ class RigProblem:
             falls.append(own + others)
         return falls
 
-    def item_products(self, state: RigState, onto: Tensor) -> list[Tensor]:
-        """For each block (V, S + 1, Q) products of each item's rows, without its own unknowns, with Q sums `onto`.
+    def field_products(self, state: RigState, basis: Callable[[Tensor], Tensor]) -> Tensor:
+        """(S + F + 1, S + F + 1) products of all rows, with the F amplitudes of a field of errors in each image.
+
+        Boards have none: what bends them from view to view would be taken for a field.
 
         Args:
             state: where.
-            onto: (S + 1, Q) of the shared unknowns, and last of the residuals.
+            basis: (V, K) values of K functions at places (V, 2) in an image, whose sides are -½ and ½. Each camera has
+                amplitudes of all of them, along columns and along rows of pixels.
         """
-        out, (found, _) = list[Tensor](), self._rows(state)
-        for block, parts in zip(self.blocks, found, strict=True):
-            rows = onto.new_zeros(0, len(onto), 0)
-            if not block.many:
-                rows = EliminatedItems(block.joined(parts, self.shared_size), block.size).rows
-            out.append(rows @ (rows.mT @ onto))
-        return out
+        terms, posed, size, each = self.term_rows(state), self.posed(state), self.shared_size, 0
+        found = []
+        for block, own in self.parts(state):
+            parts = []
+            for camera, columns, rows in block.camera_rows(posed, own):
+                if camera is None or block.many:
+                    parts.append(CameraRows(camera, columns, rows))
+                    continue
+                sides = torch.tensor(self.cameras[camera].size, dtype=torch.float64)
+                values = basis((block.pixels[:, camera, 0].nan_to_num() + 0.5) / sides - 0.5)
+                field = (values[:, :, None, None] * torch.eye(2, dtype=torch.float64)).flatten(1, 2)[..., None]
+                each = field.shape[1]
+                columns = torch.cat([columns, size + camera * each + torch.arange(each)])
+                own_rows = [rows[:, :-1], block.weighted(camera, field), rows[:, -1:]]
+                parts.append(CameraRows(camera, columns, torch.cat(own_rows, 1)))
+            found.append((block, parts))
+        whole = size + each * len(posed)
+        total = sum((self._gram(block, parts, whole) for block, parts in found), terms.new_zeros(whole + 1, whole + 1))
+        known = torch.tensor([*range(size), whole])
+        return total.index_put((known[:, None], known), terms @ terms.T, accumulate=True)
 
     def block_grams(self, state: RigState) -> list[Tensor]:
         """For each block (S + 1, S + 1) products of the rows of all its items, their own unknowns eliminated."""
@@ -186,11 +202,12 @@ class RigProblem:
             found.append(parts)
         return found, squares
 
-    def _gram(self, block: Block, parts: Sequence[CameraRows]) -> Tensor:
+    def _gram(self, block: Block, parts: Sequence[CameraRows], size: int | None = None) -> Tensor:
         """(S + 1, S + 1) products of rows, summed over the items, without what the items' own unknowns can do."""
+        size = self.shared_size if size is None else size
         if block.by_rows:
-            return EliminatedItems(block.joined(parts, self.shared_size), block.size).gram
-        return summed_products(parts, block.size, self.shared_size).off(block.size).total
+            return EliminatedItems(block.joined(parts, size), block.size).gram
+        return summed_products(parts, block.size, size).off(block.size).total
 
     def linearize(self, state: State) -> SchurLinearization | PartlyEliminated:
         """See `Problem.linearize`."""

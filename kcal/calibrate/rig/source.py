@@ -465,7 +465,7 @@ class Block(ABC):
     surveyed: ClassVar[bool] = False
 
     def __init__(self, pixels: Tensor) -> None:
-        self.seen = torch.isfinite(pixels).all(-1)
+        self.pixels, self.seen = pixels, torch.isfinite(pixels).all(-1)
         self._used = self.seen.any(-1).any(0).tolist()
 
     def __len__(self) -> int:
@@ -499,6 +499,10 @@ class Block(ABC):
     @abstractmethod
     def camera_rows(self, cameras: Sequence[PosedCamera], state: RigState) -> Iterator[CameraRows]:
         """Rows of each camera that sees anything; last those of what is known of the items beforehand."""
+
+    @abstractmethod
+    def weighted(self, camera: int, columns: Tensor) -> Tensor:
+        """(V, M, R) columns (V, M, 2, N) of a camera's pixels in the order and the units of its rows."""
 
     @abstractmethod
     def moved(self, items: Tensor, step: Tensor) -> Tensor:
@@ -582,9 +586,9 @@ class MarkBlock(Block):
         """Derivatives by where points stand, from those by where they are seen."""
         return by_q
 
-    def _white(self, camera: int, rows: Tensor) -> Tensor:
-        """(V, P, 2 N) rows (V, P, 2, N) of pixels of one camera in units of their standard deviations."""
-        return torch.einsum("vuwn,vpwn->vpun", self._whitening[:, camera], rows).flatten(-2)
+    def weighted(self, camera: int, columns: Tensor) -> Tensor:
+        """See `Block.weighted`."""
+        return torch.einsum("vuwn,vpwn->vpun", self._whitening[:, camera], columns).flatten(-2)
 
     def _prior(self, state: RigState) -> Tensor | None:
         """(V, L + 1, Q): derivatives of Q residuals of what is known of each item; the last row holds the residuals."""
@@ -624,7 +628,7 @@ class MarkBlock(Block):
     def residuals(self, cameras: Sequence[PosedCamera], state: RigState) -> Tensor:
         """See `Block.residuals`."""
         errors = self.errors(cameras, state).unbind(1)
-        white = torch.cat([self._white(c, error[:, None])[:, 0] for c, error in enumerate(errors)], -1)
+        white = torch.cat([self.weighted(c, error[:, None])[:, 0] for c, error in enumerate(errors)], -1)
         prior = self._prior(state)
         return white if prior is None else torch.cat([white, prior[:, -1]], -1)
 
@@ -659,7 +663,7 @@ class MarkBlock(Block):
                 parts.append(-w[..., None] * by_offset)
             rows = torch.cat([*parts, error[:, None]], 1)
             rows = torch.where(self.seen[:, c, None, None, :], rows, 0.0)
-            yield CameraRows(c, columns, self._white(c, rows))
+            yield CameraRows(c, columns, self.weighted(c, rows))
         prior = self._prior(state)
         if prior is not None:
             yield CameraRows(None, torch.zeros(0, dtype=torch.long), prior)

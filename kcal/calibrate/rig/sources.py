@@ -305,9 +305,9 @@ class BoardBlock(Block):
         columns = readout.columns_of(found.by_point, placed.rotation, time, points, apart=True).nan_to_num(0.0)
         return columns if reads else columns[:, MOTION:], readout.reach(points.T)
 
-    def weighted(self, c: int, columns: Tensor) -> Tensor:
-        """(V, M, R) columns (V, M, 2, N) of a camera's pixels in the order and the units of its rows."""
-        return self._seen_by[c][0].weighted(columns)
+    def weighted(self, camera: int, columns: Tensor) -> Tensor:
+        """See `Block.weighted`."""
+        return self._seen_by[camera][0].weighted(columns)
 
     def moved(self, items: Tensor, step: Tensor) -> Tensor:
         """See `Block.moved`."""

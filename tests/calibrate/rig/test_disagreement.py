@@ -1,23 +1,42 @@
-"""Parts of a rig's data that contradict each other are told, and widen its sigmas."""
+"""Smooth errors in a rig's images, which no unknown explains, are told, and widen its sigmas by what they do."""
 
 import dataclasses
+import math
+from collections.abc import Callable
 
 import pytest
+import torch
+from torch import Tensor
 
-from kcal import Baseline, RigData, solve_rig
+from kcal import RigData, solve_rig
+from kcal.calibrate.rig.contradictions import _smooth
 from kcal.calibrate.rig.result import RigResult
-from scripts.check.rig import BASELINE, NAMES, STRAIGHT, TRUTH, generator, landmarks
+from scripts.check.contradictions import boards, surveyed
+from scripts.check.rig import STRAIGHT, TRUTH
 
 
-def yaw_sigma(found: RigResult) -> float:
-    return float(found.relative_covariance()[1, 1].sqrt())
+def sigmas(found: RigResult) -> Tensor:
+    """Of the relative pitch, yaw and roll."""
+    return found.relative_covariance().diagonal()[:3].sqrt()
+
+
+def told(found: RigResult) -> list[str]:
+    return [one.text for one in found.findings if "disagrees with the rest" in one.text]
+
+
+def moved(data: RigData, field: Callable[[Tensor], Tensor]) -> RigData:
+    """The data with what the right camera sees moved by a field (N, 2) of places (N, 2) in its image."""
+    changed = {}
+    for source in data.seen:
+        pixels = source.pixels.clone()
+        pixels[:, 1] += field((pixels[:, 1] + 0.5) / torch.tensor(TRUTH.right.size, dtype=torch.float64) - 0.5)
+        changed[source.kind] = dataclasses.replace(source, pixels=pixels)
+    return dataclasses.replace(data, **changed)
 
 
 @pytest.fixture(scope="module")
 def clean() -> RigData:
-    tape = Baseline(first=0, second=1, length=BASELINE, sigma=0.005)
-    marked = landmarks(generator(5), 30)
-    return RigData(cameras=(TRUTH.left, TRUTH.right), names=NAMES, landmarks=marked, baselines=(tape,))
+    return surveyed("12 landmarks and 200 matches", 5)
 
 
 @pytest.fixture(scope="module")
@@ -26,18 +45,54 @@ def solved(clean: RigData) -> RigResult:
 
 
 def test_good_rigs_keep_their_sigmas(solved: RigResult) -> None:
-    assert not any("disagree" in text for text in solved.warnings)
+    information, scale = solved._solution.problem.linearize(solved._solution.state).information()
+    covariance = torch.linalg.inv(information) * scale[:, None] * scale
+    assert not told(solved)
+    assert torch.allclose(solved._solution.matrix, covariance, rtol=1e-6, atol=0.0)
 
 
-def test_landmarks_on_one_side_that_are_off_are_told(clean: RigData, solved: RigResult) -> None:
-    assert clean.landmarks is not None
-    pixels = clean.landmarks.pixels.clone()
-    # As if the lens of the right camera were off by 0.4 px on the right.
-    pixels[..., 1, 0] += 0.4 * (pixels[..., 1, 0] > pixels[..., 1, 0].median())
-    found = solve_rig(
-        dataclasses.replace(clean, landmarks=dataclasses.replace(clean.landmarks, pixels=pixels)), STRAIGHT
-    )
-    told = [one for one in found.findings if "disagree" in one.text]
-    assert len(told) == 1
-    assert "landmarks in the" in told[0].text
-    assert yaw_sigma(found) > 1.3 * yaw_sigma(solved)
+def test_a_lens_that_errs_in_a_corner_is_told_with_its_place_and_widens_what_it_turns(
+    clean: RigData, solved: RigResult
+) -> None:
+    def corner(places: Tensor) -> Tensor:
+        """As if the lens were off by 0.3 px there."""
+        near = (-(places - torch.tensor([0.3, 0.2])).square().sum(-1, keepdim=True) / 0.1).exp()
+        return near * torch.tensor([0.1, 0.3])
+
+    found = solve_rig(moved(clean, corner), STRAIGHT)
+    (text,) = told(found)
+    assert "what right sees in the lower right of its image" in text
+    assert float((sigmas(found) / sigmas(solved)).min()) > 1.2
+    turned = found.rotation[1] @ found.rotation[0].T @ TRUTH.right_from_left_rotation.T
+    off = torch.stack([turned[2, 1], turned[0, 2], turned[1, 0]]).abs()
+    assert float((off / sigmas(solved)).max()) > 3.0
+    assert float((off / sigmas(found)).max()) < 2.0
+
+
+def test_what_a_field_does_to_the_solution_is_what_solving_with_it_does(clean: RigData, solved: RigResult) -> None:
+    solution, amount, function = solved._solution, 0.01, 3
+
+    def field(places: Tensor) -> Tensor:
+        return -amount * _smooth(places)[:, function, None] * torch.tensor([0.0, 1.0])
+
+    size = solution.problem.shared_size
+    products = solution.problem.field_products(solution.state, _smooth)
+    pull = -solution.root @ (solution.root.T @ products[:size, size:-1])
+    each = pull.shape[1] // 2
+    expected = amount * solution.turn_rows(1) @ pull[:, each + 2 * function + 1]
+    turned = solve_rig(moved(clean, field), STRAIGHT).rotation[1] @ solved.rotation[1].T
+    found = torch.stack([turned[2, 1], turned[0, 2], turned[1, 0]])
+    assert float(expected.norm()) > 1e-7
+    assert float((found - expected).norm()) < 0.02 * float(expected.norm())
+
+
+def test_a_field_has_a_variance_of_one_and_is_alike_over_a_third_of_the_image() -> None:
+    values = _smooth(torch.tensor([[0.0, 0.0], [0.35, 0.0], [-0.4, 0.4]], dtype=torch.float64))
+    among = values @ values.T
+    assert among.diagonal().tolist() == pytest.approx([1.0] * 3, abs=0.05)
+    assert float(among[0, 1]) == pytest.approx(math.exp(-0.5), abs=0.05)
+
+
+@pytest.mark.slow
+def test_boards_that_bend_are_no_field() -> None:
+    assert not told(solve_rig(boards("15 boards, flex", 1), STRAIGHT))
