@@ -147,15 +147,14 @@ def widen_for_fields(solution: RigSolution, names: Sequence[str]) -> list[Findin
     """Look for smooth errors in the images that no unknown explains; widen the covariance for them, and tell of it."""
     size, variance = solution.problem.shared_size, solution.variance
     products = solution.problem.field_products(solution.state, _smooth)
-    if len(products) == size + 1 or not bool(products.isfinite().all()):
-        return []
     own, right = products[size:-1, size:], products[:size, size:]
     inverse = solution.root / math.sqrt(variance)
     pull = inverse @ (inverse.T @ right[:, :-1])
     left = (own - pull.T @ right) / variance
-    K, score = left[:, :-1], left[:, -1]
-    values, vectors = torch.linalg.eigh(K)
-    known, along = values.clamp_min(0.0), vectors.T @ score
+    if not len(left) or not bool(left.isfinite().all()):
+        return []
+    values, vectors = torch.linalg.eigh(left[:, :-1])
+    known, along = values.clamp_min(0.0), vectors.T @ left[:, -1]
     tau2 = (_RATIOS / known.max().clamp_min(1e-300))[:, None]
     spread = tau2 / (1.0 + tau2 * known)
     logs = 0.5 * (along.square() * spread - (tau2 * known).log1p()).sum(1)
