@@ -129,15 +129,15 @@ _RATIOS = 4.0 ** torch.arange(7, dtype=torch.float64)
 _TOLD, _MATTERS = 10.0, 1.1
 
 
-def _places(*counts: int) -> Tensor:
+def _all_over(*counts: int) -> Tensor:
     """(P, 2) places all over an image, whose sides are -½ and ½."""
     across, down = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5 for count in counts)
     return torch.cartesian_prod(across, down)
 
 
-def _smooth(places: Tensor) -> Tensor:
+def _field_modes(places: Tensor) -> Tensor:
     """(V, K) values at places (V, 2) of functions whose sum with standard normal amplitudes is a field of τ = 1."""
-    fixed = _places(*_PLACES)
+    fixed = _all_over(*_PLACES)
     among, there = (torch.exp(-0.5 * (torch.cdist(one, fixed) / _LENGTH) ** 2) for one in (fixed, places))
     root = torch.linalg.cholesky(among + 1e-6 * torch.eye(len(fixed), dtype=torch.float64))
     return torch.linalg.solve_triangular(root, there.T, upper=False).T
@@ -146,7 +146,7 @@ def _smooth(places: Tensor) -> Tensor:
 def widen_for_fields(solution: RigSolution, names: Sequence[str]) -> list[Finding]:
     """Look for smooth errors in the images that no unknown explains; widen the covariance for them, and tell of it."""
     size, variance = solution.problem.shared_size, solution.variance
-    products = solution.problem.field_products(solution.state, _smooth)
+    products = solution.problem.field_products(solution.state, _field_modes)
     own, right = products[size:-1, size:], products[:size, size:]
     inverse = solution.root / math.sqrt(variance)
     pull = inverse @ (inverse.T @ right[:, :-1])
@@ -171,7 +171,7 @@ def widen_for_fields(solution: RigSolution, names: Sequence[str]) -> list[Findin
     if float(after[worst]) <= _MATTERS * float(before[worst]):
         return []
     solution.root, step = wider, vectors @ (weight * mean).sum(0)
-    field = (_smooth(_places(3, 3)) @ step.unflatten(0, (len(names), -1, 2))).norm(dim=-1)
+    field = (_field_modes(_all_over(3, 3)) @ step.unflatten(0, (len(names), -1, 2))).norm(dim=-1)
     camera, place = divmod(int(field.argmax()), field.shape[1])
     across, down = ("left", "middle", "right")[place // 3], ("upper ", "", "lower ")[place % 3]
     moved, old, new = (math.degrees(float(one.abs()[worst])) for one in (turns @ pull @ step, before, after))
