@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -26,7 +27,7 @@ def told(found: RigResult) -> list[str]:
 
 def moved(data: RigData, field: Callable[[Tensor], Tensor]) -> RigData:
     """The data with what the right camera sees moved by a field (N, 2) of places (N, 2) in its image."""
-    changed = {}
+    changed: dict[str, Any] = {}
     for source in data.seen:
         pixels = source.pixels.clone()
         pixels[:, 1] += field((pixels[:, 1] + 0.5) / torch.tensor(TRUTH.right.size, dtype=torch.float64) - 0.5)
