@@ -246,14 +246,14 @@ def length_unit(lengths: Iterable[float | None]) -> Unit:
     """The unit for lengths that stand together: mm on a bench, m on a site, km at sea.
 
     Args:
-        lengths: meters; the largest that is finite decides.
+        lengths: meters; the largest that is finite decides; m if it is 0.
 
     Example:
-        >>> length_unit([0.28, 0.43]).name, length_unit([120.0, 5000.0]).name, length_unit([800.0, 21e3]).name
+        >>> length_unit([0.28, 0.43]).name, length_unit([0.0, math.inf]).name, length_unit([800.0, 21e3]).name
         ('mm', 'm', 'km')
     """
     largest = max((abs(one) for one in lengths if one is not None and math.isfinite(one)), default=1.0)
-    return MM if largest < 1.0 else M if largest < 1e4 else KM
+    return MM if 0.0 < largest < 1.0 else M if largest < 1e4 else KM
 
 
 def number_text(value: float, sigma: float | None = None, *, digits: int = 3, sign: bool = False) -> str:
