@@ -212,6 +212,20 @@ def test_how_often_intervals_are_right_is_one_figure_of_the_whole_chain() -> Non
     ] == []
 
 
+def test_a_figure_with_a_link_to_a_measured_page_is_in_its_tables() -> None:
+    number, missing = re.compile(r"\d+(?:\.\d+)?"), []
+    for each in PAGES:
+        text = each.read_text(encoding="utf-8")
+        for said, name in re.findall(r"\[([^][]*\d[^][]*)\]\([./\w-]*measured/([\w-]+\.md)[^)]*\)", text):
+            made = (ROOT / "docs" / "measured" / name).read_text(encoding="utf-8")
+            tables = re.sub(r"<!-- python.*?-->", "", "".join(re.findall(r"<!-- begin.*?<!-- end", made, re.DOTALL)))
+            for figure in number.findall(said):
+                digits = len(figure.partition(".")[2])
+                if all(f"{float(one):.{digits}f}" != figure for one in number.findall(tables)):
+                    missing.append(f"{each.name}: {said!r}, {name}")
+    assert missing == []
+
+
 def test_programs_were_tested_with_the_versions_of_constraints() -> None:
     pins = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line)
     page = (ROOT / "docs/reference/programs.md").read_text()
