@@ -23,7 +23,7 @@ _ENTRY = np.dtype([
 
 
 def pack(path: Path) -> bytes:
-    """The packed bytes of the binary catalogue at `path`."""
+    """The packed bytes of the binary catalog at `path`."""
     table = np.frombuffer(read_bytes(path), _ENTRY, offset=28)
     table = table[(table["ra"] != 0) | (table["magnitude"] != 0)]
     packed = np.zeros(len(table), PACKED)
@@ -38,7 +38,7 @@ def pack(path: Path) -> bytes:
 
 
 def main() -> None:
-    """Write the packed catalogue and say what is in it."""
+    """Write the packed catalog and say what is in it."""
     data = pack(Path(sys.argv[1]))
     write_atomic(PACKED_FILE, data)
     catalog = StarCatalog.bundled()

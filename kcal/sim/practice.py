@@ -354,7 +354,7 @@ def _meet(first: tuple[slice, slice], second: tuple[slice, slice]) -> bool:
     return all(a.start < b.stop and b.start < a.stop for a, b in zip(first, second, strict=True))
 
 
-# The night above a practice site: stars as the cameras see them, wherever a catalogue says that they stand.
+# The night above a practice site: stars as the cameras see them, wherever a catalog says that they stand.
 
 # Gray levels of the dark sky, and all of a star of magnitude 0.
 _SKY, _BRIGHTEST = 14.0, 60_000.0

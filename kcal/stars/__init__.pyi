@@ -5,7 +5,7 @@
 from kcal.stars.detect import detect_stars as detect_stars
 from kcal.stars.night import name_stars as name_stars
 
-# Catalogue and sky
+# Catalog and sky
 from kcal.stars.night import SkyView as SkyView
 from kcal.stars.sky import StarCatalog as StarCatalog
 from kcal.stars.sky import Air as Air

@@ -353,7 +353,7 @@ class PlannedStars(NamedTuple):
 
 
 def planned_stars(plan: NightPlan) -> PlannedStars:
-    """How many stars of the catalogue an image will show, and how well they determine the relative yaw.
+    """How many stars of the catalog an image will show, and how well they determine the relative yaw.
 
     Example:
         >>> found = planned_stars(NightPlan(focal_px=1600, size=(1920, 1080), aperture_mm=2.9))

@@ -280,7 +280,7 @@ class StarCamera:
     Args:
         lens: the fit: camera, residuals, rotations of the images that were used.
         images: their numbers.
-        stars: (N,) index in the catalogue of each of their named stars.
+        stars: (N,) index in the catalog of each of their named stars.
         pixels: (N, 2) where these were seen.
         refused: number of each other image, and why it was not used.
         agreement: of the stars with the boards that calibrated the camera before; None where none did.
@@ -490,7 +490,7 @@ def _near_middle(found: DetectedStars, size: tuple[int, int], share: float) -> D
 
 
 class _StarImage(NamedTuple):
-    """The named stars of an image, their numbers (N,) in the catalogue, and the rotation from the stars' frame."""
+    """The named stars of an image, their numbers (N,) in the catalog, and the rotation from the stars' frame."""
 
     field: StarField
     star: np.ndarray
@@ -522,7 +522,7 @@ def _star_fields(
 def _directions(view: SkyView, catalog: StarCatalog) -> np.ndarray:
     if not view.on_earth:
         return celestial_directions(catalog, view.time)
-    # Refracted, but in the catalogue's axes, in which rotations of other images and the first names are.
+    # Refracted, but in the catalog's axes, in which rotations of other images and the first names are.
     there = view.directions(catalog)
     up = there[:, 2] > math.sin(math.radians(3.0))
     celestial = celestial_directions(catalog, view.time)

@@ -38,7 +38,7 @@ _ROUGH = 4.0
 _LEAST_REACH = 1.0
 # Standard deviations by which refraction must differ from that of place and time, and px by which a good lens errs.
 _SURE, _LENS = 5.0, 0.04
-# px: another star of the catalogue that is nearer, and not fainter by more magnitudes, pulls a star's center.
+# px: another star of the catalog that is nearer, and not fainter by more magnitudes, pulls a star's center.
 _CROWDED, _FAINTER = 6.0, 2.5
 
 
@@ -49,7 +49,7 @@ class Attitude:
     Args:
         rotation: (3, 3) camera from the frame of the directions.
         covariance: (3, 3) of a small turn of the camera about the axes of that frame, rad², from noise of the marks.
-        star: (N,) index in the catalogue of each star of the image; -1 for stars without a name or left out.
+        star: (N,) index in the catalog of each star of the image; -1 for stars without a name or left out.
         residual: (N, 2) projected minus seen, px; NaN for those.
         rms_px: root of the mean squared residual along an axis.
         widened: by how much residuals are larger than their sigmas say, at least 1; the covariance has it.
@@ -76,7 +76,7 @@ def fit_attitude(
     Args:
         pixels: (N, 2) stars of the image.
         sigma: (N,) of each along an axis, px.
-        directions: (M, 3) unit vectors of the catalogue, in any frame.
+        directions: (M, 3) unit vectors of the catalog, in any frame.
         magnitude: (M,).
         camera: which lens.
         rotation: (3, 3) camera from that frame, to begin with.
@@ -166,7 +166,7 @@ def _names_at(
     rotation: Tensor,
     least: float,
 ) -> NDArray[np.int64]:
-    """(N,) the star of the catalogue at each pixel; -1 for none, or where another star pulls it.
+    """(N,) the star of the catalog at each pixel; -1 for none, or where another star pulls it.
 
     Stars whose cosine from the optical axis is at least `least` may be in the image.
     """
@@ -285,7 +285,7 @@ class NamedStars:
         detected: all stars of the image.
         view: when and where.
         attitude: rotation from the frame of `directions` and what belongs to it.
-        directions: (M, 3) of the catalogue: east, north, up if `on_earth`, otherwise celestial.
+        directions: (M, 3) of the catalog: east, north, up if `on_earth`, otherwise celestial.
         on_earth: whether the attitude is that on the Earth.
         covariance: (3, 3) of the attitude about that frame's axes, rad², with clock, UT1 and air.
         warnings: what to doubt.
@@ -361,7 +361,7 @@ def name_stars(
         if identify(direction * [-1.0, 1.0, 1.0], reach, catalog=catalog, field=field) is not None:
             raise InputError("the image is mirrored: its stars have names only from left to right; mirror it back")
         raise InputError(
-            f"{len(found.pixels)} points of light, which no stars of the catalogue explain: too few of them are "
+            f"{len(found.pixels)} points of light, which no stars of the catalog explain: too few of them are "
             "stars, the camera file is of another lens, or clouds cover most of the sky"
         )
     celestial = night_sky.celestial_directions(catalog, view.time)

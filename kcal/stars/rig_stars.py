@@ -23,7 +23,7 @@ from kcal.stars.night import NamedStars
 from kcal.stars.sky import EARTH_RATE, StarCatalog, pole_in_enu, refraction_sigma
 from kcal.threads import in_one_thread
 
-# Radians: of the Yale catalogue along an axis, 1 second of arc.
+# Radians: of the Yale catalog along an axis, 1 second of arc.
 _CATALOG_SIGMA = math.radians(1.0 / 3600)
 # px: stars without a name are matched within this distance of where the named ones put them.
 _MATCH = 2.0
@@ -178,7 +178,7 @@ def _with_names(moment: Moment, catalog: StarCatalog, number: int, *, on_earth: 
 
 
 def _without_names(moment: Moment, cameras: Sequence[Camera], number: int) -> Iterator[_Row]:
-    """Stars that the catalogue does not have, seen by the first and another camera where the named ones put them."""
+    """Stars that the catalog does not have, seen by the first and another camera where the named ones put them."""
     first = min(moment)
     here = moment[first]
     free = np.flatnonzero(here.attitude.star < 0)

@@ -29,7 +29,7 @@ from kcal.texts import brief
 
 # The bright stars: positions, proper motions and magnitudes, and names for the brightest.
 #
-# The catalogue in the package is the Yale Bright Star Catalogue, 5th revised edition (D. Hoffleit and W. H. Warren Jr.,
+# The catalog in the package is the Yale Bright Star Catalogue, 5th revised edition (D. Hoffleit and W. H. Warren Jr.,
 # 1991, Astronomical Data Center; CDS V/50): 9,096 stars to magnitude 6.5 and some fainter ones, with positions good to
 # about 1 second of arc. It is a compilation of facts that is distributed without a license text.
 
@@ -64,7 +64,7 @@ class StarCatalog:
     """Stars by number: places at J2000 in the International Celestial Reference System, motions and magnitudes.
 
     Args:
-        number: (N,) of the star in its catalogue; Harvard Revised (HR) in the one that kcal brings along.
+        number: (N,) of the star in its catalog; Harvard Revised (HR) in the one that kcal brings along.
         ra: (N,) right ascension, radians.
         dec: (N,) declination, radians.
         pm_ra: (N,) proper motion in right ascension times cos δ, radians a year.
@@ -92,9 +92,9 @@ class StarCatalog:
     def __post_init__(self) -> None:
         columns = [self.ra, self.dec, self.pm_ra, self.pm_dec, self.magnitude]
         if any(column.shape != self.number.shape or column.ndim != 1 for column in columns):
-            raise InputError("star catalogue: six arrays of the same shape (N,) are needed")
+            raise InputError("star catalog: six arrays of the same shape (N,) are needed")
         if not all(np.isfinite(column).all() for column in columns) or (np.abs(self.dec) > np.pi / 2).any():
-            raise InputError("star catalogue: a value is not finite, or a declination is beyond 90 degrees")
+            raise InputError("star catalog: a value is not finite, or a declination is beyond 90 degrees")
 
     def __len__(self) -> int:
         """How many stars there are."""
@@ -126,7 +126,7 @@ class StarCatalog:
             InputError: a year for which proper motions are not linear any more.
         """
         if not FIRST_YEAR <= year <= LAST_YEAR:
-            raise InputError(f"star catalogue: the year {year:.0f} is outside {FIRST_YEAR:.0f} to {LAST_YEAR:.0f}")
+            raise InputError(f"star catalog: the year {year:.0f} is outside {FIRST_YEAR:.0f} to {LAST_YEAR:.0f}")
         time, cos = year - 2000.0, np.cos(self.dec)
         ra, dec = self.ra + time * self.pm_ra / np.maximum(cos, 1e-9), self.dec + time * self.pm_dec
         return unit_vectors(ra, dec)
@@ -245,7 +245,7 @@ def celestial_directions(catalog: StarCatalog, time: datetime.datetime | None = 
     with _quiet(erfa):
         context, _ = erfa.apci13(*_julian(erfa, time))
         ra, dec = erfa.atciq(*_columns(catalog), 0.0, 0.0, context)
-    # From the axes of the equator of date back to those of the catalogue.
+    # From the axes of the equator of date back to those of the catalog.
     return unit_vectors(ra, dec) @ np.asarray(context["bpn"], np.float64)
 
 
@@ -328,7 +328,7 @@ class PairTable(NamedTuple):
     """Pairs of stars by their angle; stars are counted by brightness, the brightest being 0.
 
     Attributes:
-        order: (N,) index in the catalogue of each star by brightness.
+        order: (N,) index in the catalog of each star by brightness.
         directions: (N, 3) unit vectors of these.
         pairs: (2 P, 2) uint16, each pair both ways.
         angle: (2 P,) radians, ascending.
@@ -425,7 +425,7 @@ _BY_CHANCE = 1e-9
 _TESTED = 80
 # Triangles with a side below this share of the field propose attitudes that are too rough.
 _SHORTEST = 0.06
-# Stars of the catalogue in the field for each star of the image, of which not all are the brightest.
+# Stars of the catalog in the field for each star of the image, of which not all are the brightest.
 _DEEPER, _LEAST_IN_FIELD = 3.0, 24.0
 _MOST_PROPOSALS = 20_000
 # Of the reach within which matches are counted: a good attitude is nearer than the reach.
@@ -436,8 +436,8 @@ class Identification(NamedTuple):
     """An attitude on which many stars agree.
 
     Attributes:
-        rotation: (3, 3) camera from the catalogue's frame.
-        star: (N,) index in the catalogue of each star of the image; -1 where it has none.
+        rotation: (3, 3) camera from the catalog's frame.
+        star: (N,) index in the catalog of each star of the image; -1 where it has none.
         by_chance: expected number of attitudes on which as many stars agree by chance.
     """
 
@@ -460,7 +460,7 @@ def identify(
     field: float = 0.0,
     corners: int = 10,
 ) -> Identification | None:
-    """Find which stars of the catalogue are seen, and from that where the camera looks; nothing need be known of it.
+    """Find which stars of the catalog are seen, and from that where the camera looks; nothing need be known of it.
 
     Args:
         rays: (N, 3) unit vectors in the camera's frame towards the stars of an image, the brightest first.
@@ -593,7 +593,7 @@ def _tested(
 def _by_chance(met: NDArray[np.bool_], chance: float) -> float:
     """How probable it is that chance explains the matches among the brightest stars, at the number that suits it least.
 
-    The brightest stars of an image are in the catalogue; of the many faint ones most may be too faint for it.
+    The brightest stars of an image are in the catalog; of the many faint ones most may be too faint for it.
     """
     sizes = np.arange(4, len(met) + 1)
     # Three matches are those of the triangle.

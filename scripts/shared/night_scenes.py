@@ -1,4 +1,4 @@
-"""Rendered night images: catalogue stars through a camera, with noise, and what is no star."""
+"""Rendered night images: catalog stars through a camera, with noise, and what is no star."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def star_pixels(
     faintest: float = 5.0,
     place: Origin = PLACE,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Pixels (N, 2) and indices (N,) in the catalogue of the stars in view, the brightest first."""
+    """Pixels (N, 2) and indices (N,) in the catalog of the stars in view, the brightest first."""
     catalog = StarCatalog.bundled()
     there = observed_directions(catalog, time, place)
     up = np.flatnonzero((catalog.magnitude <= faintest) & (there[:, 2] > 0.02))

@@ -124,7 +124,7 @@ def night(rig: TrueRig, cameras: tuple[Camera, Camera], case: Case, draw: np.ran
             inside = (valid & lens.inside(at)).numpy()
             index = up[inside]
             pixels = at.numpy()[inside] + draw.normal(0, STAR, (len(index), 2))
-            # Of stars without names, the frame is that of the catalogue.
+            # Of stars without names, the frame is that of the catalog.
             turn = rotation[side] if case.named else rotation[side] @ _turn(seen[index], known[index])
             moment[side] = NamedStars(
                 detected=DetectedStars(pixels, np.full(len(index), STAR), np.ones(len(index)), 0.02, {}),

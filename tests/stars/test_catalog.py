@@ -1,4 +1,4 @@
-"""The catalogue of stars, and chance matches."""
+"""The catalog of stars, and chance matches."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kcal import InputError, Origin
 from kcal.stars.sky import _NAMES, Air, StarCatalog, _by_chance, celestial_directions, observed_directions
 from kcal.values import instant
 
-# The catalogue in the package, and where its stars are seen.
+# The catalog in the package, and where its stars are seen.
 
 
 SIRIUS, POLARIS = 2491, 424

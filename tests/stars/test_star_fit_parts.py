@@ -445,7 +445,7 @@ class TestRoughLens:
         found, celestial = _directions(view, CATALOG), celestial_directions(CATALOG, TIME)
         there = observed_directions(CATALOG, TIME, PLACE)
         up = there[:, 2] > math.sin(math.radians(3.0))
-        # Below the horizon as the catalogue has it, above it bent by refraction: some minutes of arc, upwards.
+        # Below the horizon as the catalog has it, above it bent by refraction: some minutes of arc, upwards.
         np.testing.assert_array_equal(found[~up], celestial[~up])
         moved = np.degrees(np.linalg.norm(found - celestial, axis=1)[up]) * 60
         assert 0.0 < moved.max() < 20.0

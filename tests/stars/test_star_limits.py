@@ -340,5 +340,5 @@ class TestCatalogs:
         columns: dict[str, NDArray[Any]] = {"number": np.array([1])}
         columns |= {name: np.zeros(1) for name in ("ra", "dec", "pm_ra", "pm_dec", "magnitude")}
         StarCatalog(**(columns | {"dec": np.array([-np.pi / 2])}))
-        with pytest.raises(InputError, match="star catalogue"):
+        with pytest.raises(InputError, match="star catalog"):
             StarCatalog(**(columns | change))

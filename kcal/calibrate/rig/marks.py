@@ -337,7 +337,7 @@ class StarSource(MarkSource):
         pixels: (S, C, 2), NaN where a camera did not see it.
         pixel_sigma: (S, C) of a star along an axis, px.
         direction: (S, 3) unit vectors in the local frame, refracted; NaN for stars without a name.
-        direction_sigma: (S,) radians, of the catalogue and of the model of refraction; infinite without a name.
+        direction_sigma: (S,) radians, of the catalog and of the model of refraction; infinite without a name.
         effects: what shifts all stars together: the clocks, the air.
 
     Raises:
@@ -392,7 +392,7 @@ class StarSource(MarkSource):
         return found
 
     def begin(self, cameras: Sequence[Camera], start: Start) -> Tensor:
-        """See `ItemSource.begin`; as the catalogue has it, or along the ray of the first camera that sees it."""
+        """See `ItemSource.begin`; as the catalog has it, or along the ray of the first camera that sees it."""
         nothing = torch.zeros(len(self.names), dtype=torch.float64)
         seen = first_rays(cameras, start, self.pixels, nothing, start.center[0])
         direction = torch.where(self.named[:, None], self.direction, seen)
@@ -412,7 +412,7 @@ class StarSource(MarkSource):
 
 
 class StarBlock(MarkBlock):
-    """Stars, each with a unit vector (V, 3) that the catalogue knows, if the star has a name.
+    """Stars, each with a unit vector (V, 3) that the catalog knows, if the star has a name.
 
     Camera c sees star i in the direction d_i + Σ_e u_e (t_eci × d_i + s_eic) with the unknowns u_e of clocks and air,
     which are standard normal beforehand.
@@ -439,7 +439,7 @@ class StarBlock(MarkBlock):
         return torch.einsum("vjun,vlj->vlun", by_q, torch.stack(side_axes(state.items[:, :3]), 1))
 
     def _prior(self, state: RigState) -> Tensor | None:
-        # The catalogue: along the two axes across the star's direction.
+        # The catalog: along the two axes across the star's direction.
         star = state.items[:, :3]
         axes = torch.stack(side_axes(star), 1)
         error = torch.einsum("vlj,vj->vl", axes, star - self._known) * self._weight[:, None]
