@@ -270,14 +270,14 @@ def chi2_quantile(freedom: Tensor | float, probability: float) -> Tensor:
 
 
 def chi2_tail(chi2: Tensor | float, freedom: Tensor | float) -> Tensor:
-    """Probability of a χ² as large or larger by chance.
+    """Probability of a χ² as large or larger by chance; 1 without freedom.
 
     Example:
         >>> round(float(chi2_tail(29.59, 10)), 5)
         0.001
     """
     chi2, freedom = (torch.as_tensor(value, dtype=torch.float64) for value in (chi2, freedom))
-    return torch.special.gammaincc(0.5 * freedom, 0.5 * chi2.clamp_min(0.0))
+    return torch.where(freedom > 0, torch.special.gammaincc(0.5 * freedom, 0.5 * chi2.clamp_min(0.0)), 1.0)
 
 
 def beyond_chance(chi2: float, freedom: float) -> bool:
@@ -287,7 +287,7 @@ def beyond_chance(chi2: float, freedom: float) -> bool:
         >>> beyond_chance(10.8, 1), beyond_chance(10.9, 1)
         (False, True)
     """
-    return freedom > 0 and chi2 > float(chi2_quantile(freedom, _LIKELY))
+    return freedom > 0 and float(chi2_tail(chi2, freedom)) < 1.0 - _LIKELY
 
 
 def variance_factor(chi2: float, freedom: float) -> float:

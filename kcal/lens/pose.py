@@ -147,13 +147,11 @@ def vector_from_rotation(rotation: Tensor) -> Tensor:
     rotation = as_tensor("rotation", rotation)
     if rotation.shape[-2:] != (3, 3):
         raise InputError(f"rotation: shape (..., 3, 3) is needed, got {tuple(rotation.shape)}")
-    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotation.unbind(-2))
     # The products of a quaternion's components: each row is the quaternion, and nothing cancels in the longest.
-    turned, first, second, third = h - f, b + d, c + g, f + h
-    tall, flat, low = c - g, d - b, 1.0 + a + e + i
-    rows = [low, turned, tall, flat, turned, 1.0 + a - e - i, first, second]
-    rows += [tall, first, 1.0 - a + e - i, third, flat, second, third, 1.0 - a - e + i]
-    every = torch.stack(rows, -1).unflatten(-1, (4, 4))
+    axis = (rotation - rotation.mT)[..., [2, 0, 1], [1, 2, 0]][..., None]
+    trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    block = rotation + rotation.mT + (1.0 - trace) * torch.eye(3).to(rotation)
+    every = torch.cat([torch.cat([1.0 + trace, axis.mT], -1), torch.cat([axis, block], -1)], -2)
     longest = every.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*every.shape[:-2], 1, 4)
     quaternion = every.gather(-2, longest)[..., 0, :]
     cosine, along = quaternion[..., :1].abs(), quaternion[..., 1:] * torch.where(quaternion[..., :1] < 0, -1.0, 1.0)

@@ -564,8 +564,8 @@ def check_ranges(
     plane = torch.linalg.qr(torch.stack(weighed, 1))[0]
     part = float((plane.T @ unexplained).square().sum())
     degrees, others = plane.shape[1], len(names) - plane.shape[1]
-    common = _chance(part, degrees)
-    rest = _chance(chi2 - part, others) if others else math.nan
+    common = float(chi2_tail(part, degrees))
+    rest = float(chi2_tail(chi2 - part, others)) if others else math.nan
     chance = min(common, rest) if others else common
     causes = [_shift(name, unexplained, slope) for name, slope in zip(slopes, weighed, strict=True)]
     causes.append(_noisier(covariance, error))
@@ -585,7 +585,7 @@ def check_ranges(
         findings.append(_contradiction(causes, chance))
     return RangeCheck(
         names=names, known=ranges, measured=measured, low=low, high=high, pulls=error / deviation, chi2=chi2,
-        probability=_chance(chi2, len(names)), common=common, rest=rest, causes=tuple(causes),
+        probability=float(chi2_tail(chi2, len(names))), common=common, rest=rest, causes=tuple(causes),
         findings=tuple(findings),
     )  # fmt: skip
 
@@ -606,7 +606,7 @@ def _shift(name: str, error: Tensor, slope: Tensor) -> Cause:
     """The most likely amount of a shift, of errors in units of their sigmas."""
     fall = float(error @ slope) ** 2 / float(slope.square().sum())
     amount, sigma = float(error @ slope) / float(slope.square().sum()), float(slope.norm()) ** -1
-    return Cause(name, amount, sigma, math.sqrt(fall), _chance(float(error.square().sum()) - fall, len(error) - 1))
+    return Cause(name, amount, sigma, math.sqrt(fall), float(chi2_tail(error.square().sum() - fall, len(error) - 1)))
 
 
 def _noisier(covariance: Callable[[Tensor], Tensor], error: Tensor) -> Cause:
@@ -616,12 +616,7 @@ def _noisier(covariance: Callable[[Tensor], Tensor], error: Tensor) -> Cause:
     costs = squares + 2.0 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     best = int(costs.argmin())
     fall = math.sqrt(float(costs[0] - costs[best]))
-    return Cause("noise", float(_TIMES[best]), math.nan, fall, _chance(float(squares[best]), len(error)))
-
-
-def _chance(chi2: float, freedom: int) -> float:
-    """Probability of a χ² as large or larger; 1 without freedom."""
-    return float(chi2_tail(chi2, freedom)) if freedom else 1.0
+    return Cause("noise", float(_TIMES[best]), math.nan, fall, float(chi2_tail(squares[best], len(error))))
 
 
 _CURES = {

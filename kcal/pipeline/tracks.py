@@ -406,10 +406,8 @@ class Tracker:
         # Operations of small tensors take a sixth less time in this mode, which compiled steps do not know.
         with torch.no_grad() if self._compiled else torch.inference_mode():
             found = self._taken(views, time)
-        plain: dict[str, Any] = {
-            name: value.clone() for name, value in found._asdict().items() if isinstance(value, Tensor)
-        }
-        return found._replace(state=TrackStates(*(value.clone() for value in found.state)), **plain)
+        plain: list[Any] = [value.clone() if isinstance(value, Tensor) else value for value in found]
+        return Tracks(*plain)._replace(state=TrackStates(*(value.clone() for value in found.state)))
 
     def _taken(self, views: ObjectViews, time: float | None) -> Tracks:
         if views.cameras != len(self.localize.rig):
@@ -578,9 +576,7 @@ class Tracker:
         return imm.Timing(delay, clock, unsure)
 
     def _tier(self, track: TrackRecord) -> int:
-        if track.number == 0:
-            return 1
-        return 0 if self.time - track.last <= self.options.lose_after_s else -1
+        return 0 if self._is_told(track) else 1 if track.number == 0 else -1
 
     def _update(
         self,

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 import kcal
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.errors import InputError
@@ -154,22 +156,17 @@ def camera_tables(
         rows.append([name, number_text(value, own, digits=6), "" if own is None else number_text(own, own)])
     tables = [facts, rows]
     if known is not None and known.covariance is not None:
-        tables.append(_correlations(camera))
+        tables.append(_correlations(camera, known.covariance))
     return tables
 
 
-def _correlations(camera: Camera) -> list[list[str]]:
-    assert camera.calibration is not None
-    assert camera.calibration.covariance is not None
+def _correlations(camera: Camera, covariance: Tensor) -> list[list[str]]:
     names = camera.names[: shown_parameters(camera.model.hybrid)]
-    covariance = camera.calibration.covariance[: len(names), : len(names)]
+    covariance = covariance[: len(names), : len(names)]
     spread = covariance.diagonal().clamp_min(0.0).sqrt()
-    found = []
-    for i in range(len(names)):
-        for j in range(i):
-            if float(spread[i]) > 0 and float(spread[j]) > 0:
-                found.append((float(covariance[i, j] / (spread[i] * spread[j])), names[j], names[i]))
-    # Parameters that are held equal say nothing.
+    rows = (covariance / (spread[:, None] * spread)).tolist()
+    found = [(value, names[j], names[i]) for i, row in enumerate(rows) for j, value in enumerate(row[:i])]
+    # Parameters that are held, or held equal, say nothing.
     found = sorted((one for one in found if abs(one[0]) < 0.99999), key=lambda one: -abs(one[0]))[:5]
     return [["strongest correlations", ""], *([f"{a}, {b}", f"{value:+.3f}"] for value, a, b in found)]
 
