@@ -384,7 +384,6 @@ class Tracker:
         # By key of a track and camera: the row of the last objects that it has its mark from.
         self.seen_now: dict[tuple[int, int], int] = {}
         self.steps = track_steps(self.localize, self.options.lasting_px)
-        self._compiled = compiled
         if compiled:
             self.steps = compiled_steps(self.steps, len(rig), self.beliefs, self.shared.mixing)
 
@@ -404,7 +403,7 @@ class Tracker:
             InputError: a time before that of the last call, or none.
         """
         # Operations of small tensors take a sixth less time in this mode, which compiled steps do not know.
-        with torch.no_grad() if self._compiled else torch.inference_mode():
+        with torch.no_grad() if isinstance(self.steps.move, _Compiled) else torch.inference_mode():
             found = self._taken(views, time)
         plain: list[Any] = [value.clone() if isinstance(value, Tensor) else value for value in found]
         return Tracks(*plain)._replace(state=TrackStates(*(value.clone() for value in found.state)))
