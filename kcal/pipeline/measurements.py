@@ -114,12 +114,12 @@ def product(first: Tensor, second: Tensor) -> Tensor:
         >>> torch.allclose(product(first, second).movedim(-1, 0), first.movedim(-1, 0) @ second.movedim(-1, 0))
         True
     """
-    return (first[:, :, None] * second).sum(1)
+    return (first.unsqueeze(2) * second).sum(1)
 
 
 def outer(first: Tensor, second: Tensor) -> Tensor:
     """(R, C, ...) from vectors (R, ...) and (C, ...)."""
-    return first[:, None] * second
+    return first.unsqueeze(1) * second
 
 
 def congruent(slope: Tensor, covariance: Tensor) -> Tensor:

@@ -402,7 +402,7 @@ class Tracker:
         Raises:
             InputError: a time before that of the last call, or none.
         """
-        # Operations of small tensors take a sixth less time in this mode, which compiled steps do not know.
+        # Operations of small tensors take some percent less time in this mode, which compiled steps do not know.
         with torch.no_grad() if isinstance(self.steps.move, _Compiled) else torch.inference_mode():
             found = self._taken(views, time)
         plain: list[Any] = [value.clone() if isinstance(value, Tensor) else value for value in found]
