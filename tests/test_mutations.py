@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from kcal.checks import beyond_chance, chi2_quantile, variance_factor
+from kcal.checks import beyond_chance, chi2_quantile, chi2_tail, variance_factor
 from scripts.check.mutants import Draw, first_draw, interval
 from scripts.check.mutations import sites
 
@@ -102,6 +102,8 @@ def test_quantiles_are_those_of_the_tables() -> None:
     freedom = torch.tensor([1, 2, 5, 10, 100])
     table = [10.828, 13.816, 20.515, 29.588, 149.449]
     assert chi2_quantile(freedom, 0.999).tolist() == pytest.approx(table, abs=6e-4)
+    assert chi2_tail(torch.tensor(table), freedom).tolist() == pytest.approx([0.001] * 5, rel=5e-4)
+    assert [float(chi2_tail(*none)) for none in ((-1e-12, 3), (5.0, 0))] == [1.0, 1.0]
     assert chi2_quantile(freedom, 0.9).tolist() == pytest.approx([2.706, 4.605, 9.236, 15.987, 118.498], abs=6e-4)
 
 
