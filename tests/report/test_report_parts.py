@@ -494,8 +494,7 @@ class TestPage:
         covariance[2, 3] = covariance[3, 2] = -2.4
         covariance[0, 2] = covariance[2, 0] = 1.0
         covariance[1, 2] = covariance[2, 1] = -1.0
-        camera.calibration = CameraCalibration(covariance=covariance)
-        assert _correlations(camera)[1:3] == [["cx, cy", "-0.800"], ["fx, cx", "+0.500"]]
+        assert _correlations(camera, covariance)[1:3] == [["cx, cy", "-0.800"], ["fx, cx", "+0.500"]]
 
     def test_tables_of_a_camera(self) -> None:
         result = calibrated()
