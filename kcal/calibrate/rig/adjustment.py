@@ -230,7 +230,8 @@ class Adjustment:
             reads = camera.model.hybrid or camera.calibration is None
             columns, reach = block.motion_columns(c, posed[c], state, reads=reads)
             weighted, focal = functools.partial(block.weighted, c), float(camera.params[0])
-            found = self.motion[c] = board_motion(columns, weighted, focal, reach, rig, c)
+            apart = any(one and any(one.apart) for one in beside)
+            found = self.motion[c] = board_motion(columns, weighted, focal, reach, rig, c, apart=apart)
             if found is not None:
                 before[c] = rig.parts[c].rows
                 rig.put(c, WithoutMotion(weighted(found.columns))(before[c]))

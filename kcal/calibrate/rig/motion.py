@@ -71,6 +71,9 @@ def summed_products(parts: Sequence[CameraRows], size: int, shared_size: int) ->
 # under a normal prior, whitened residuals r have the covariance I + U Uᵀ, U being their derivatives by the motion times
 # its standard deviations, and (I + U Uᵀ)^-½ r takes the place of r.
 
+# Nats by which a shift of the image must be likelier than a motion of the board where boards moved before another
+# camera, because hands do not move as the prior says: 9 of two webcams without a stabilizer.
+_CLEARLY = 20.0
 # Nats by which motions must raise the evidence of the other boards, without the one that shows most motion.
 _WORTH_OF_OTHERS = 1.0
 # Mean square of residuals, in standard deviations, below which corners have no noise.
@@ -106,8 +109,9 @@ class BoardMotion(NamedTuple):
 
 
 def board_motion(
-    columns: Tensor, weighted: Callable[[Tensor], Tensor], focal: float, reach: float, rig: RigRows, camera: int
-) -> BoardMotion | None:
+    columns: Tensor, weighted: Callable[[Tensor], Tensor], focal: float, reach: float, rig: RigRows, camera: int,
+    *, apart: bool = False,
+) -> BoardMotion | None:  # fmt: skip
     """Estimate how boards move while a camera reads its rows, and between exposures; None where they stand still.
 
     What differs from exposure to exposure is a motion of the boards, or a shift of the image, whichever is likelier.
@@ -120,6 +124,7 @@ def board_motion(
         reach: of the board about its middle, distances of the board.
         rig: rows of all cameras, other cameras' motions integrated out.
         camera: its number.
+        apart: boards moved between the exposures of another camera.
     """
     good = rig.good
     if int(good.sum()) < _FEWEST or camera not in rig.parts:
@@ -135,7 +140,7 @@ def board_motion(
     shifts = torch.cat([columns[:, :-_POSE], torch.zeros_like(columns[:, -_POSE:])], 1)
     shifts[:, -3, 0] = shifts[:, -2, 1] = APART * focal
     other = _amplitudes(weighted(shifts), rig, camera)
-    if by_image := other[-1] > found[-1] + WORTH:
+    if by_image := other[-1] > found[-1] + (_CLEARLY if apart else WORTH):
         columns, white, found = shifts, weighted(shifts), other
     data, families, best, _ = found
     # Motion that a single board shows is an error of that board.
