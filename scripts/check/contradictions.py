@@ -134,7 +134,7 @@ def judged(kind: str, draws: int) -> list[str]:
 KINDS = (
     "12 landmarks and 200 matches", "30 landmarks", "15 boards", "12 landmarks and 200 matches, lens",
     "12 landmarks and 200 matches, radial lens", "12 landmarks and 200 matches, bias of matches",
-    "12 landmarks and 200 matches, bias of half the matches", "30 landmarks, lens", "30 landmarks, radial lens",
+    "12 landmarks and 200 matches, bias of half the matches", "30 landmarks, lens",
     "15 boards, lens", "15 boards, flex",
 )  # fmt: skip
 
