@@ -211,7 +211,7 @@ def lines(name: str, records: list[Record], *terms: str) -> Iterator[str]:
 
 
 def moving_lines(records: list[Record]) -> Iterator[str]:
-    """One row for each kind: what was named, and what error bars contain."""
+    """One row for each kind: what was named, and what error bars contain; what has no record stays."""
     rows = []
     for kind in MOVING:
         own = [r for r in records if r["key"][0] == kind and r["key"][-1] == "default"]
@@ -220,23 +220,22 @@ def moving_lines(records: list[Record]) -> Iterator[str]:
             continue
         known, rigs = ([r for r in part if "refused" not in r] for part in (views, pairs))
         named = [
-            f"{100 * statistics.fmean(cause in r['causes'] for r in known):.0f} %" if known else "–"
+            f"{100 * statistics.fmean(cause in r['causes'] for r in known):.0f} %" if known else None
             for cause in ("lens", "bending", "motion", "views")
         ]
-        moment = f"{100 * statistics.fmean('synchronization' in r['names'] for r in rigs):.0f} %" if rigs else "–"
-        yaw = f"{100 * statistics.fmean(r['yaw'] for r in rigs):.0f} %" if rigs else "–"
-        frames = share(r["frame"] for r in known if "frame" in r)
-        rows.append(
-            [
-                kind, f"{len(views)} / {len(pairs)}", f"{len(views) - len(known)} / {len(pairs) - len(rigs)}",
-                *named, moment, share(r["everywhere"] for r in known), frames, yaw,
-            ]
-        )  # fmt: skip
+        moment, lens = (
+            f"{100 * statistics.fmean(name in r['names'] for r in rigs):.0f} %" if rigs else None
+            for name in ("synchronization", "moving-lens")
+        )
+        yaw = f"{100 * statistics.fmean(r['yaw'] for r in rigs):.0f} %" if rigs else None
+        inside = [share(r[which] for r in known if which in r) if known else None for which in ("everywhere", "frame")]
+        counts = [f"{len(views)} / {len(pairs)}", f"{len(views) - len(known)} / {len(pairs) - len(rigs)}"]
+        rows.append([kind, *(counts if views else [None] * 2), *named, lens, moment, *inside, yaw])
     head = [
-        "what moves", "captures / rigs", "refused", "lens named", "bending", "motion", "other views", "other moments",
-        "mean camera in 95 %", "another frame's", "range of a rig in 95 %",
+        "what moves", "captures / rigs", "refused", "lens named", "bending", "motion", "other views",
+        "lens named by a rig", "other moments", "mean camera in 95 %", "another frame's", "range of a rig in 95 %",
     ]  # fmt: skip
-    return table(head, rows)
+    return merged("ordinary.md", "moving", head, rows)
 
 
 def rig_lines(records: list[Record]) -> Iterator[str]:
