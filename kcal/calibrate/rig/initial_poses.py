@@ -213,8 +213,13 @@ class InitialPoses:
             return
         points, self._good = boards.points, boards.seen_well(data.cameras)
         for c, (camera, enough) in enumerate(zip(data.cameras, self._good.T, strict=True)):
-            pixels = torch.where(enough[:, None, None], boards.pixels[:, c], torch.nan)
-            alone.append(pose_alone(points, pixels, camera, solver))
+            rotation = torch.full((len(enough), 3, 3), math.nan, dtype=torch.float64)
+            translation = torch.full((len(enough), 3), math.nan, dtype=torch.float64)
+            rms = torch.full((len(enough),), math.nan, dtype=torch.float64)
+            if bool(enough.any()):
+                found, rms[enough] = pose_alone(points, boards.pixels[enough, c], camera, solver)
+                rotation[enough], translation[enough] = found.rotation, found.translation
+            alone.append((Pose(rotation, translation), rms))
         check_cameras(data, self._good, alone, solver)
         self._alone = [poses for poses, _ in alone]
 

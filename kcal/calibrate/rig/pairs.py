@@ -372,20 +372,21 @@ def consensus(
     proposals += [right.some(i).after(half_turn(board)).after(left.some(i).inverse()) for i in some]
     as_read, other_end = pixels[:, 1], pixels[:, 1].flip(-2)
     points_left = board @ left.rotation.transpose(-1, -2) + left.translation[:, None]
-    rotation, translation = (torch.stack(each)[:, None] for each in zip(*proposals, strict=True))
-    projected, valid = cameras[1].project(points_left @ rotation.mT + translation[:, None])
-    projected = torch.where(valid[..., None], projected, torch.inf)
-    errors = torch.stack([_distance(projected, as_read), _distance(projected, other_end)])
-    turned = errors[1] < _TURNED * errors[0]
-    error = torch.where(turned, errors[1], errors[0])
-    # At least two pairs must agree, or every proposal would be right about its own pair.
-    rank, best = min(len(pixels), max(2, (len(pixels) + 1) // 2)), 0
-    scores = error.sort().values[:, rank - 1].tolist()
-    for number, score in enumerate(scores):
+    best: tuple[float, Pose, Tensor, Tensor] | None = None
+    for number, proposal in enumerate(proposals):
+        projected, valid = cameras[1].project(points_left @ proposal.rotation.T + proposal.translation)
+        projected = torch.where(valid[..., None], projected, torch.inf)
+        errors = torch.stack([_distance(projected, as_read), _distance(projected, other_end)])
+        turned = errors[1] < _TURNED * errors[0]
+        error = torch.where(turned, errors[1], errors[0])
+        # At least two pairs must agree, or every proposal would be right about its own pair.
+        rank = min(len(error), max(2, (len(error) + 1) // 2))
+        score = float(error.sort().values[rank - 1])
         # One pair, or boards that hardly moved, fit a turned proposal as well: then the order is as read.
-        if score < (_TURNED if number >= len(some) else 1.0) * scores[best]:
-            best = number
-    return proposals[best], turned[best], error[best]
+        if best is None or score < (_TURNED if number >= len(some) else 1.0) * best[0]:
+            best = (score, proposal, turned, error)
+    assert best is not None
+    return best[1:]
 
 
 def _distance(projected: Tensor, observed: Tensor) -> Tensor:
