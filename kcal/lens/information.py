@@ -166,16 +166,20 @@ class CameraInformation:
         rows = data.placed(self.data.slots, self.estimate).rows
         return dataclasses.replace(self, rows=rows[:, :-1], residuals=rows[:, -1])
 
-    def changed(self, by: Tensor) -> CameraInformation:
-        """What is known after a change of the camera by columns (5 + P, K), each times a standard normal amount."""
+    def changed(self, by: Tensor, *, prior: bool = False) -> CameraInformation:
+        """What is known after a change of the camera by columns (5 + P, K), each times a standard normal amount.
+
+        The prior is one of the camera before, or as well of the changed one: then it stays a prior.
+        """
         count, amounts = self.lens_size, numbered("change", by.shape[1])
         lens = torch.linalg.pinv(self.selection()[:, :count]) @ by
         step = torch.cat([torch.eye(count, dtype=by.dtype), -lens], 1)
-        before = (self.data + self.lens_prior).replaced(self.lens, self.estimate[:count], step, (*self.lens, *amounts))
+        data = self.data if prior else self.data + self.lens_prior
+        before = data.replaced(self.lens, self.estimate[:count], step, (*self.lens, *amounts))
         zero = by.new_zeros(len(amounts))
         both = before + Gaussian.independent(amounts, zero, zero + 1.0)
         rows = both.marginal((*self.lens, *self.board)).rows
-        sigma = torch.where(torch.arange(len(self.sigma)) < count, math.inf, self.sigma)
+        sigma = self.sigma if prior else torch.where(torch.arange(len(self.sigma)) < count, math.inf, self.sigma)
         return dataclasses.replace(self, rows=rows[:, :-1], residuals=rows[:, -1], sigma=sigma)
 
     def half(self) -> Tensor:

@@ -152,6 +152,16 @@ def test_without_board_is_the_marginal() -> None:
     torch.testing.assert_close(torch.linalg.lstsq(part[:, :-1], -part[:, -1:]).solution, step, rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.parametrize("prior", [False, True])
+def test_a_changed_camera(prior: bool) -> None:
+    """The covariance grows by the change. A prior of all cameras alike stays one, for who takes the data away."""
+    known, by = information(), torch.zeros(7, 2, dtype=torch.float64)
+    by[[0, 1], 0], by[2, 1] = 0.2, 0.3
+    found = known.changed(by, prior=prior)
+    torch.testing.assert_close(found.covariance(), known.covariance() + by @ by.T, rtol=1e-9, atol=1e-12)
+    assert torch.equal(found.sigma[:5], known.sigma[:5] if prior else torch.full_like(known.sigma[:5], math.inf))
+
+
 def test_rows_are_those_of_its_parts() -> None:
     """Data, priors and what others say, in the order of the unknowns, with residuals at the estimate."""
     known = dataclasses.replace(information(), others=torch.ones(1, 3, dtype=torch.float64))

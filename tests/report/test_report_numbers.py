@@ -127,13 +127,11 @@ class TestSentences:
 
     def test_correlations(self) -> None:
         """The five strongest but those of parameters that are held equal."""
-        camera = Camera(CAMERA.params, size=CAMERA.size, model=CAMERA.model)
         covariance = torch.diag(torch.tensor([4.0, 4.0, 1.0, 9.0, 0.0])).double()
         covariance[0, 1] = covariance[1, 0] = 4.0
         covariance[0:2, 2] = covariance[2, 0:2] = -1.0
         covariance[2, 3] = covariance[3, 2] = 0.75
-        camera.calibration = CameraCalibration(covariance=covariance)
-        rows = _correlations(camera)
+        rows = _correlations(CAMERA, covariance)
         assert rows[1:4] == [["fx, cx", "-0.500"], ["fy, cx", "-0.500"], ["cx, cy", "+0.250"]]
         assert len(rows) == 6
         assert not any("skew" in row[0] for row in rows)

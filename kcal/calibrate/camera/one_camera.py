@@ -607,7 +607,8 @@ def _for_later(fit: HybridFit, sigma: Tensor) -> HybridFit:
         _of_information(fit),
     )
     change[:2, 0], change[2, 1], change[3, 2] = fit.state.parameters[:2], 1.0, 1.0
-    known = fit.information.changed(change * sigma)
+    # Lenses of all frames have the same prior.
+    known = fit.information.changed(change * sigma, prior=True)
     half[: len(columns), columns] = known.half()
     return dataclasses.replace(fit, information=known, half=half)
 
