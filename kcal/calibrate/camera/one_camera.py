@@ -601,14 +601,11 @@ def _widened(fit: HybridFit, pixels: Tensor, theta: Tensor, sigma: Tensor) -> Hy
 
 def _for_later(fit: HybridFit, sigma: Tensor) -> HybridFit:
     """A fit with error bars that allow for θ of the next view, whose standard deviations (3,) these are."""
-    change, half, columns = (
-        sigma.new_zeros(len(fit.information.slots), _SIZE),
-        torch.zeros_like(fit.half),
-        _of_information(fit),
-    )
+    change, half = sigma.new_zeros(len(fit.information.slots), _SIZE), torch.zeros_like(fit.half)
     change[:2, 0], change[2, 1], change[3, 2] = fit.state.parameters[:2], 1.0, 1.0
     # Lenses of all frames have the same prior.
     known = fit.information.changed(change * sigma, prior=True)
+    columns = _of_information(fit)
     half[: len(columns), columns] = known.half()
     return dataclasses.replace(fit, information=known, half=half)
 
