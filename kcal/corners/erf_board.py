@@ -115,7 +115,7 @@ def crossing(
 
 
 def _both(of_edges: Tensor) -> Tensor:
-    """The sum over both edges (..., edge, K), which `sum` takes five times as long for."""
+    """The sum over both edges (..., edge, K); `sum` takes five times as long."""
     first, second = of_edges.unbind(-2)
     return first + second
 

@@ -230,9 +230,8 @@ def moving_lines(records: list[Record]) -> Iterator[str]:
         yaw = f"{100 * statistics.fmean(r['yaw'] for r in rigs):.0f} %" if rigs else None
         inside = [share(r[which] for r in known if which in r) if known else None for which in ("everywhere", "frame")]
         counts = [f"{len(views)} / {len(pairs)}", f"{len(views) - len(known)} / {len(pairs) - len(rigs)}"]
-        # Kinds of pairs alone have no captures.
-        told = counts if views or kind.endswith("apart, hand") else [None] * 2
-        rows.append([kind, *told, *named, lens, moment, *inside, yaw])
+        # Of pairs at other moments there are rigs alone.
+        rows.append([kind, *(counts if views or KINDS[kind].apart else [None] * 2), *named, lens, moment, *inside, yaw])
     head = [
         "what moves", "captures / rigs", "refused", "lens named", "bending", "motion", "other views",
         "lens named by a rig", "other moments", "mean camera in 95 %", "another frame's", "range of a rig in 95 %",

@@ -146,6 +146,8 @@ def _field_modes(places: Tensor) -> Tensor:
 def widen_for_fields(solution: RigSolution, names: Sequence[str]) -> list[Finding]:
     """Look for smooth errors in the images that no unknown explains; widen the covariance for them, and tell of it."""
     size, variance = solution.problem.shared_size, solution.variance
+    if all(block.many for block in solution.problem.blocks):
+        return []
     products = solution.problem.field_products(solution.state, _field_modes)
     own, right = products[size:-1, size:], products[:size, size:]
     inverse = solution.root / math.sqrt(variance)

@@ -140,7 +140,7 @@ def board_motion(
     shifts = torch.cat([columns[:, :-_POSE], torch.zeros_like(columns[:, -_POSE:])], 1)
     shifts[:, -3, 0] = shifts[:, -2, 1] = APART * focal
     other = _amplitudes(weighted(shifts), rig, camera)
-    if by_image := other[-1] > found[-1] + (_CLEARLY if apart else WORTH):
+    if by_image := other[-1] < found[-1] - (_CLEARLY if apart else WORTH):
         columns, white, found = shifts, weighted(shifts), other
     data, families, best, _ = found
     # Motion that a single board shows is an error of that board.
@@ -162,12 +162,11 @@ def board_motion(
 
 
 def _amplitudes(white: Tensor, rig: RigRows, camera: int) -> tuple[ViewData, PriorFamilies, Amplitudes, float]:
-    """What the boards say of motions (V, M, R), the amplitudes of largest evidence, and nats gained over none."""
+    """What the boards say of motions (V, M, R), the amplitudes of largest evidence, and its negative logarithm."""
     data, families = rig.told(camera, white)
     begin = np.full(white.shape[1] // AXES, math.log(MEDIAN) - 0.5 * math.log(rig.variance))
     best = maximize_evidence(data, families, Amplitudes(_NONE, rig.variance, begin), _NO_PRIOR)
-    still = loss_at(data.only([]), best._replace(log_ratio=begin[:0], variance=rig.variance), families, 1.0)
-    return data, families, best, still - loss_at(data, best, families, 1.0)
+    return data, families, best, loss_at(data, best, families, 1.0)
 
 
 class RigRows:
