@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -26,7 +27,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding
 from kcal.gaussian import triangular
-from kcal.solve.schur import without_local
+from kcal.solve.schur import matrix_product, products_of, without_local
 from kcal.texts import number_text
 
 # A view's own scale and principal point, θ = (ln scale, cx, cy) off those of all views: of another camera or crop, of a
@@ -64,8 +65,11 @@ _APART, _APART_CENTER = 0.1, 0.02
 # Rounds of refits; share of θ, and standard deviations of the camera, by which the last one changes it; the largest
 # share of a step of groups that the next one is taken to be; and steps of the search for amplitudes.
 _ROUNDS, _REST, _MOVED, _AHEAD, _STEPS = 12, 0.05, 0.2, 0.6, 60
-# Share of variances by which the last step of that search changes them.
-_SETTLED = 1e-3
+# Nats by which the last step of that search raises the evidence; shares of a variance to which one step may lead; and
+# the largest variance, in the widest ones that are expected.
+_SETTLED, _STEP, _MOST = 1e-2, (0.05, 4.0), 100.0
+# Share of a unit, squared, that the widest movements change of combinations of lens and board that are left out.
+_UNFELT = 1e-3
 # What to do about a lens that moves.
 _STILL = "lock focus and zoom, switch the image stabilizer off (also in the camera's app), and photograph again"
 # Fewer views tell nothing; one view alone may be wrong otherwise, and a scale and principal point suits it.
@@ -80,7 +84,8 @@ _ALIKE = 1e-10
 _CLEAR, _TOLD, _AGREE = 3.0, 3.0, 9.2
 
 
-class _ByView(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class _ByView:
     """χ² by x of each view: its motion and bending over their deviations, θ, and how its board bends: 2 gᵀx + xᵀNx.
 
     And by the lens and board of all views, y, in combinations of unit weight: 2 (b + Σ Cᵀx)ᵀ y + yᵀy. They would hide
@@ -114,19 +119,23 @@ class _ByView(NamedTuple):
         H = torch.eye(C.shape[-1], dtype=torch.float64) - shared[..., 1:].sum(0)
         return _ByView(N, g, *_unit_weight(H, C, self.b - shared[..., 0]), (), self.begin[:_SIZE])
 
-    def joint(self) -> tuple[Tensor, Tensor]:
-        """K (V, 3, V, 3) and g (V, 3) of χ² by θ off its mean, lens and board at their best: 2 gᵀθ + θᵀKθ."""
-        K, g = -torch.einsum("vas,wbs->vawb", self.C, self.C), self.g - self.C @ self.b.sum(0)
-        K.diagonal(dim1=0, dim2=2).add_(self.N.permute(1, 2, 0))
+    @functools.cached_property
+    def joint(self) -> _Joint:
+        """By θ off its mean, lens and board at their best."""
+        g, N, C = self.g - self.C @ self.b.sum(0), self.N, self.C - self.C.mean(0)
         # The mean is that of the camera, which hardly anything but its prior tells from the lens.
-        K = K - K.mean(0, keepdim=True)
-        return K - K.mean(2, keepdim=True), g - g.mean(0)
+        one = torch.eye(_SIZE, dtype=torch.float64).expand_as(N)
+        off = (N - 0.5 * N.mean(0)) / len(N)
+        return _Joint(N, torch.cat([one, off, C], 2), torch.cat([off, one, C], 2), g - g.mean(0))
 
     def score(self, own: list[int]) -> float:
         """Standard deviations by which the slopes by these numbers of θ are steeper than by noise alone."""
-        K, g = self.joint()
-        K = K[:, own][..., own]
-        return float((g[:, own].square().sum() - torch.einsum("vava->", K)) / (math.sqrt(2.0) * K.norm()))
+        N, F, G, g = self.joint
+        N, F, G = N[:, own][..., own], F[:, own], G[:, own]
+        noise = torch.einsum("vaa->", N) - (F * G).sum()
+        square = N.square().sum() - 2.0 * ((N @ F) * G).sum()
+        square += (products_of(F.flatten(0, 1).T) * products_of(G.flatten(0, 1).T)).sum()
+        return float((g[:, own].square().sum() - noise) / (2.0 * square).sqrt())
 
     def later(self, most: Tensor) -> Tensor:
         """(3,) root of the mean square of θ in views to come, by all deviations up to `most` (3,) and their evidence.
@@ -134,43 +143,55 @@ class _ByView(NamedTuple):
         So it has room for the error of the likeliest deviation, and for a lens that moves though that is not proven.
         Zeros where the evidence is against it.
         """
-        K, g = self.joint()
-        values, vectors = torch.linalg.eigh(torch.einsum("vawb,a,b->vawb", K, most, most).flatten(2).flatten(0, 1))
-        squares, pull = 4.0 ** -torch.arange(0.0, 6.5, 0.5, dtype=K.dtype), vectors.T @ (most * g).flatten()
-        times = squares[:, None] * values.clamp_min(0.0)
-        nats = 0.5 * (squares[:, None] * pull.square() / (1.0 + times) - times.log1p()).sum(1)
+        N, F, G, g = self.joint
+        basis = _felt(F[..., 2 * _SIZE :], most)
+        F, G = (torch.cat([part[..., : 2 * _SIZE], part[..., 2 * _SIZE :] @ basis], 2) for part in (F, G))
+        squares, nats = 4.0 ** -torch.arange(0.0, 6.5, 0.5, dtype=g.dtype), list[Tensor]()
+        for root in squares.sqrt()[:, None] * most:
+            own = torch.eye(_SIZE, dtype=g.dtype) + root[:, None] * N * root
+            at = torch.linalg.solve(own, root[:, None] * torch.cat([F, g[..., None]], 2))
+            across = (root[:, None] * G).flatten(0, 1).T @ at.flatten(0, 1)
+            left = torch.eye(F.shape[2], dtype=g.dtype) - across[:, :-1]
+            gained = (root * g * at[..., -1]).sum()
+            gained += (root * g).flatten() @ at[..., :-1].flatten(0, 1) @ torch.linalg.solve(left, across[:, -1])
+            nats.append(0.5 * (gained - torch.logdet(own).sum() - torch.linalg.slogdet(left).logabsdet))
         odds = math.log(_MOVING / (1.0 - _MOVING) / len(squares))
-        likely = torch.cat([nats.new_zeros(1), odds + nats]).softmax(0)
+        likely = torch.cat([g.new_zeros(1), odds + torch.stack(nats)]).softmax(0)
         return most * (likely[1:] @ squares).sqrt() * (likely[0] < 1.0 - _MOVING)
 
     def total(self, theta: Tensor) -> Tensor:
         """(...) the change of χ² by θ (..., V, 3)."""
-        K, g = self.joint()
-        return ((2.0 * g + torch.einsum("vawb,...wb->...va", K, theta)) * theta).sum((-2, -1))
+        return ((self.joint.g + self.joint.slope(theta)) * theta).sum((-2, -1))
 
     def best(self, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The best θ of both groups (..., 2, 3), its covariance (..., 6, 6), and by how many nats it is likelier (...).
 
         `second` (..., V) tells which views are in the second group.
         """
-        K, g = self.joint()
-        groups, unit = torch.stack([~second, second], -1).to(g.dtype), self.begin[:_SIZE].repeat(2)
-        N = torch.einsum("...vi,vawb,...wj->...iajb", groups, K, groups).flatten(-4, -3).flatten(-2)
-        inverse = unit[:, None] * torch.linalg.pinv(unit[:, None] * N * unit, rtol=_ALIKE, hermitian=True) * unit
-        slope = (groups.mT @ g).flatten(-2)
+        N, F, G, g = self.joint
+        groups, unit = torch.stack([~second, second], -2).to(g.dtype), self.begin[:_SIZE].repeat(2)
+        summed, of_F, of_G = ((groups @ part.flatten(1)).unflatten(-1, part.shape[1:]) for part in (N, F, G))
+        K = -of_F.flatten(-3, -2) @ of_G.flatten(-3, -2).mT
+        K.unflatten(-1, (2, -1)).unflatten(-3, (2, -1)).diagonal(dim1=-4, dim2=-2).add_(summed.movedim(-3, -1))
+        inverse = unit[:, None] * torch.linalg.pinv(unit[:, None] * K * unit, rtol=_ALIKE, hermitian=True) * unit
+        slope = (groups @ g).flatten(-2)
         both = -(inverse @ slope[..., None])[..., 0]
         return both.unflatten(-1, (2, _SIZE)), inverse, -0.5 * (slope * both).sum(-1)
 
     def by_group(self, second: Tensor) -> Tensor:
         """(..., V) of χ² with each view in the second group, less that with it in the first one."""
-        (K, g), both = self.joint(), self.best(second)[0]
+        joint, both = self.joint, self.best(second)[0]
         theta = torch.where(second[..., None], both[..., 1:, :], both[..., :1, :])
-        slope, apart = g + torch.einsum("vawb,...wb->...va", K, theta), both[..., 1, :] - both[..., 0, :]
-        bend = torch.einsum("...a,vavb,...b->...v", apart, K, apart)
-        return 2.0 * (slope @ apart[..., None])[..., 0] + torch.where(second, -bend, bend)
+        apart = both[..., 1, :] - both[..., 0, :]
+        bend = torch.einsum("...a,vab,...b->...v", apart, joint.N - joint.F @ joint.G.mT, apart)
+        return 2.0 * (joint.slope(theta) @ apart[..., None])[..., 0] + torch.where(second, -bend, bend)
 
     def spread(self, tied: Sequence[int]) -> _Spread:
-        """Normal motions and others, whose amplitudes have the largest evidence (by EM); `tied` tells which are one."""
+        """Normal motions and others, whose amplitudes have the largest evidence; `tied` tells which are one.
+
+        Variances become the mean squares over the number of views that tell of them (MacKay, 1992), where that does not
+        raise the evidence, those of expectation maximization, which is safe and slow.
+        """
         count, tied = len(self.ties), tied[: len(self.begin)]
         ties = torch.tensor([*self.ties, *tied])
         index = (ties >= 0).nonzero()[:, 0]
@@ -178,33 +199,65 @@ class _ByView(NamedTuple):
             zeros = self.g.new_zeros(len(self.g), len(tied))
             return _Spread(0.0, zeros[:, 0], zeros[0], zeros)
         N, g, one = self.N[:, index[:, None], index], self.g[:, index], torch.eye(len(index), dtype=torch.float64)
-        # Other combinations of lens and board are felt by none of these numbers.
-        basis = torch.linalg.qr(self.C[:, index].flatten(0, 1).T)[0]
-        C, each_b = self.C[:, index] @ basis, self.b @ basis
+        C, widest = self.C[:, index], torch.cat([self.g.new_ones(count), self.begin.square()])[index]
+        basis = _felt(C, widest.sqrt())
+        C, each_b = matrix_product(C, basis), self.b @ basis
         b, free = each_b.sum(0), torch.eye(basis.shape[1], dtype=torch.float64)
         share = (ties[index] == ties[index, None]).double()
         share = share / share.sum(1)
-        variance = share @ torch.cat([self.g.new_full((count,), _LESS), self.begin.square()])[index]
+        variance = safe = share @ torch.where(index < count, _LESS, widest)
+        least, found = math.inf, (g[:, 0], variance, g)
         for _ in range(_STEPS):
             root = variance.sqrt()
-            inner = one + root[:, None] * N * root
-            P = root[:, None] * torch.linalg.inv(inner) * root
-            PC, flat = P @ C, C.flatten(0, 1)
-            M = torch.linalg.cholesky(free - flat.T @ PC.flatten(0, 1))
-            y = -torch.cholesky_solve((b - PC.flatten(0, 1).T @ g.flatten())[:, None], M)[:, 0]
-            mean = -(P @ g[..., None])[..., 0] - PC @ y
-            by_others = torch.linalg.solve_triangular(M, PC.flatten(0, 1).T, upper=False).square().sum(0)
-            before, spread = variance, P.diagonal(dim1=1, dim2=2) + by_others.view(mean.shape)
-            variance = share @ (spread + mean.square()).mean(0)
-            if bool(((variance - before).abs() <= _SETTLED * before).all()):
+            inner = torch.linalg.cholesky(one + root[:, None] * N * root)
+            half = torch.linalg.solve_triangular(inner, torch.diag(root), upper=False)
+            by_shared, by_own = matrix_product(half, C), (half @ g[..., None])[..., 0]
+            flat = by_shared.flatten(0, 1)
+            M, unsolved = torch.linalg.cholesky_ex(free - products_of(flat.T))
+            y = -torch.cholesky_solve((b - flat.T @ by_own.flatten())[:, None], M)[:, 0]
+            mean = -(half.mT @ (by_own + by_shared @ y)[..., None])[..., 0]
+            nats = -0.5 * ((mean * g).sum(-1) + each_b @ (y + b)) - inner.diagonal(dim1=1, dim2=2).log().sum(1)
+            nats -= M.diagonal().log().sum() / len(nats)
+            loss = -float(nats.sum())
+            if unsolved or not loss <= least:
+                variance, least = safe, math.inf
+                continue
+            found, gained, least = (nats, root, mean), least - loss, loss
+            if gained < _SETTLED:
                 break
-        nats = -0.5 * ((mean * g).sum(-1) + each_b @ (y + b) + torch.linalg.slogdet(inner).logabsdet)
-        nats -= M.diagonal().log().sum() / len(nats)
+            others = matrix_product(half.mT, by_shared).flatten(0, 1).T
+            others = torch.linalg.solve_triangular(M, others, upper=False).square().sum(0)
+            spread = share @ (half.square().sum(1) + others.view(mean.shape)).mean(0)
+            squares = share @ mean.square().mean(0)
+            safe, known = squares + spread, (variance - spread).clamp_min(1e-300)
+            variance = torch.minimum(variance * (squares / known).clamp(*_STEP), _MOST * widest)
+        nats, root, mean = found
         sigma, each = N.new_zeros(len(ties)), N.new_zeros(len(N), len(ties))
         sigma[index], each[:, index] = root, mean
         # A second amplitude must be worth it, and a scale, by which a lens that is not quite as modeled seems to move.
         paid = 0.5 * len(ties[index].unique()) * math.log(len(N)) + WORTH * (max(0, *tied) + (tied[0] >= 0))
         return _Spread(float(nats.sum()) - paid, nats, sigma[count:][: len(tied)], each[:, count:])
+
+
+class _Joint(NamedTuple):
+    """χ² by θ of all views, 2 gᵀθ + θᵀKθ, K being block diagonal but for a matrix of low rank.
+
+    Attributes:
+        N: (V, 3, 3) of K = N - FGᵀ.
+        F: (V, 3, R).
+        G: (V, 3, R).
+        g: (V, 3).
+    """
+
+    N: Tensor
+    F: Tensor
+    G: Tensor
+    g: Tensor
+
+    def slope(self, theta: Tensor) -> Tensor:
+        """(..., V, 3) g + Kθ, of θ (..., V, 3)."""
+        shared = theta.flatten(-2) @ self.G.flatten(0, 1)
+        return self.g + (self.N @ theta[..., None])[..., 0] - (shared @ self.F.flatten(0, 1).T).view(theta.shape)
 
 
 class _Spread(NamedTuple):
@@ -673,19 +726,27 @@ def _by_view(
     shared = (shared * deviation[:, None])[:, deviation > 0]
     rows = torch.cat([rows[:, :POSE], own, lens, bends, shared, rows[:, -1:]], 1)
     off, x = without_local(rows, POSE) / noise, torch.cat([motion, theta], 1)
-    gram, size = off @ off.mT, x.shape[1] + bends.shape[1]
+    size = x.shape[1] + bends.shape[1]
+    gram, lens_and_board = matrix_product(off[:, :size], off.mT), off[:, size:-1].transpose(0, 1).flatten(1)
     x = torch.nn.functional.pad(x, (0, bends.shape[1]))[..., None]
-    N, C = gram[:, :size, :size], gram[:, :size, size:-1]
-    g = gram[:, :size, -1] - (N @ x)[..., 0]
+    N, C = gram[..., :size], gram[..., size:-1]
+    g = gram[..., -1] - (N @ x)[..., 0]
     # There is no better lens and board than those of the state.
-    H = gram[:, size:-1, size:-1].sum(0) + torch.eye(C.shape[-1], dtype=torch.float64)
+    H = products_of(lens_and_board) + torch.eye(C.shape[-1], dtype=torch.float64)
     return _ByView(N, g, *_unit_weight(H, C, -(C.mT @ x)[..., 0]), () if ties is None else tuple(ties.tolist()), begin)
+
+
+def _felt(C: Tensor, widest: Tensor) -> Tensor:
+    """(S, R) combinations of lens and board that the widest movements (X,) of views feel; C (V, X, S) are products."""
+    felt, basis = torch.linalg.eigh(products_of((C * widest[:, None]).flatten(0, 1).T))
+    return basis[:, felt > _UNFELT]
 
 
 def _unit_weight(H: Tensor, C: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """C (V, X, S) and b (V, S) by combinations of unit weight of unknowns whose products are H (S, S)."""
     both = torch.cat([C, b[:, None]], 1)
-    both = torch.linalg.solve_triangular(torch.linalg.cholesky(H), both.mT, upper=False).mT
+    flat = torch.linalg.solve_triangular(torch.linalg.cholesky(H), both.flatten(0, 1).T, upper=False)
+    both = flat.T.view(both.shape)
     return both[:, :-1], both[:, -1]
 
 

@@ -21,7 +21,8 @@ from kcal.calibrate.camera.solve import calibrate_parametric
 from kcal.calibrate.camera.warnings import board_distances, corner_pupil, distance_text
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns, moving_residuals
-from kcal.calibrate.problem.views import Views, poses_under
+from kcal.calibrate.problem.state import BoardState
+from kcal.calibrate.problem.views import Views, poses_under, refine_poses
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
 from kcal.gaussian import half_of_covariance
@@ -276,7 +277,10 @@ def _compare(
     corners = 0
     for fitted, other in (results, results[::-1]):
         views = Views(board_points=fitted.board_points, pixels=seen_pixels(other))
-        squares, still = held_out_squares(fitted.camera, views, fitted.hybrid)
+        start = BoardState.flat(
+            fitted.camera.params.detach(), other.cam_from_board_rotation, other.cam_from_board_translation
+        )
+        squares, still = held_out_squares(fitted.camera, views, fitted.hybrid, start)
         sums += torch.stack([squares.sum(), other.residuals.square().nansum(), still.sum()])
         corners += int(other.residuals[..., 0].isfinite().sum())
     held_out, own, still_rms = (sums / corners).sqrt().tolist()
@@ -304,12 +308,17 @@ def _plain_lens(
     return PlainLens(model, found.held_out, own)
 
 
-def held_out_squares(camera: Camera, views: Views, judge: HybridFit | None) -> tuple[Tensor, Tensor]:
+def held_out_squares(
+    camera: Camera, views: Views, judge: HybridFit | None, start: BoardState | None = None
+) -> tuple[Tensor, Tensor]:
     """(V,) squared residuals of held-out views, with poses, and motions as of the judge's views, solved again.
 
-    Then with poses alone. Infinite where a view has no pose.
+    Then with poses alone. Infinite where a view has no pose; `start` has poses that are nearly right, where known.
     """
-    poses, cost = poses_under(camera, views, _POSES)
+    if start is None:
+        poses, cost = poses_under(camera, views, _POSES)
+    else:
+        poses, cost = refine_poses(views, camera.model, start, _POSES)
     squares = torch.nan_to_num(2.0 * cost, nan=math.inf)
     if judge is None or judge.readout is None:
         return squares, squares

@@ -259,7 +259,16 @@ def test_amplitudes_from_quadratic_forms() -> None:
     few = module._ByView(
         0.06 * torch.eye(3).double().expand(12, 3, 3), -each, none[:, None].expand(12, 3, 0), none, (), begin
     )
-    likely = few.spread(module._LENS[0]).sigma
+    found = few.spread(module._LENS[0])
+    likely, all_nats = found.sigma, []
+    for ratio in torch.linspace(0.5, 2.0, 61, dtype=torch.float64).tolist():
+        # The evidence of normal movements, in closed form, beside that of none.
+        one, variance = torch.eye(2, dtype=torch.float64), (ratio * float(likely[1])) ** 2
+        data = one + variance * few.N[:, 1:, 1:]
+        gained = variance * few.g[:, None, 1:] @ torch.linalg.solve(data, few.g[:, 1:, None])
+        all_nats.append(0.5 * float(gained.sum() - torch.logdet(data).sum()))
+    assert found.nats == pytest.approx(max(all_nats) - 0.5 * math.log(12), abs=2.0 * module._SETTLED)
+    assert all_nats[20] == pytest.approx(max(all_nats), abs=2.0 * module._SETTLED)
     assert 1.02 < float(few.later(8.0 * likely)[1] / likely[1]) < 1.1
     assert not bool(still.later(torch.tensor([0.0, 30.0, 30.0], dtype=torch.float64)).any())
     theta = theta - theta.mean(0)
