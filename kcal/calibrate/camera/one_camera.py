@@ -68,6 +68,8 @@ _ROUNDS, _REST, _MOVED, _AHEAD, _STEPS = 12, 0.05, 0.2, 0.6, 60
 # Nats by which the last step of that search raises the evidence; shares of a variance to which one step may lead; and
 # the largest variance, in the widest ones that are expected.
 _SETTLED, _STEP, _MOST = 1e-2, (0.05, 4.0), 100.0
+# Views of which rows are in memory together.
+_TOGETHER = 256
 # Share of a unit, squared, that the widest movements change of combinations of lens and board that are left out.
 _UNFELT = 1e-3
 # What to do about a lens that moves.
@@ -713,26 +715,29 @@ def _by_view(
     deviation: Tensor | None = None,
 ) -> _ByView:
     """Of what a problem's views show; `deviation` (S,) of the priors of lens and board, zero or None where held."""
-    rows, local, motion = problem.corner_rows(state), problem.local_size, state.motion
-    own, shared, slots = rows[:, POSE:local], rows[:, local:-1], problem.free.slots
-    zoom = state.parameters[0] * shared[:, slots[0]]
-    if slots[1] != slots[0]:
-        zoom = zoom + state.parameters[1] * shared[:, slots[1]]
-    if spread is not None:
-        own, motion = own * spread[..., None], motion / spread.clamp_min(1e-30)
-    lens = torch.cat([zoom[:, None], shared[:, list(slots[2:4])]], 1)
-    bends = shared[:, len(problem.free) :][:, :_SIZE]
+    local, slots, motion = problem.local_size, problem.free.slots, state.motion
     deviation = theta.new_zeros(problem.unknown_count) if deviation is None else deviation
-    shared = (shared * deviation[:, None])[:, deviation > 0]
-    rows = torch.cat([rows[:, :POSE], own, lens, bends, shared, rows[:, -1:]], 1)
-    off, x = without_local(rows, POSE) / noise, torch.cat([motion, theta], 1)
-    size = x.shape[1] + bends.shape[1]
-    gram, lens_and_board = matrix_product(off[:, :size], off.mT), off[:, size:-1].transpose(0, 1).flatten(1)
-    x = torch.nn.functional.pad(x, (0, bends.shape[1]))[..., None]
-    N, C = gram[..., :size], gram[..., size:-1]
+    spread = torch.ones_like(motion) if spread is None else spread
+    grams, H = list[Tensor](), torch.eye(int((deviation > 0).sum()), dtype=torch.float64)
+    for first in range(0, len(theta), _TOGETHER):
+        views = slice(first, first + _TOGETHER)
+        rows = problem.corner_rows(state, views)
+        shared = rows[:, local:-1]
+        zoom = state.parameters[0] * shared[:, slots[0]]
+        if slots[1] != slots[0]:
+            zoom = zoom + state.parameters[1] * shared[:, slots[1]]
+        lens = torch.cat([zoom[:, None], shared[:, list(slots[2:4])]], 1)
+        own, bends = rows[:, POSE:local] * spread[views, :, None], shared[:, len(problem.free) :][:, :_SIZE]
+        shared, size = (shared * deviation[:, None])[:, deviation > 0], local - POSE + _SIZE + bends.shape[1]
+        off = without_local(torch.cat([rows[:, :POSE], own, lens, bends, shared, rows[:, -1:]], 1), POSE) / noise
+        grams.append(matrix_product(off[:, :size], off.mT))
+        H += products_of(off[:, size:-1].transpose(0, 1).flatten(1))
+    gram = torch.cat(grams)
+    N, C = gram[..., : (size := gram.shape[1])], gram[..., size:-1]
+    x = torch.cat([motion / spread.clamp_min(1e-30), theta], 1)
+    x = torch.nn.functional.pad(x, (0, size - x.shape[1]))[..., None]
     g = gram[..., -1] - (N @ x)[..., 0]
     # There is no better lens and board than those of the state.
-    H = products_of(lens_and_board) + torch.eye(C.shape[-1], dtype=torch.float64)
     return _ByView(N, g, *_unit_weight(H, C, -(C.mT @ x)[..., 0]), () if ties is None else tuple(ties.tolist()), begin)
 
 

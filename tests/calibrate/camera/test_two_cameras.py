@@ -275,9 +275,36 @@ def test_amplitudes_from_quadratic_forms() -> None:
     at, before = views.b.sum(0) + (views.C.mT @ theta[..., None])[..., 0].sum(0), views.b.sum(0)
     fixed = (theta * (2.0 * views.g + (views.N @ theta[..., None])[..., 0])).sum()
     torch.testing.assert_close(views.total(theta), fixed - at @ at + before @ before)
+    # As with all entries of the matrix of χ² off the mean of θ.
+    flat, mean = views.C.flatten(0, 1), torch.eye(3, dtype=torch.float64).repeat(count, count) / count
+    K, g = torch.block_diag(*views.N) - flat @ flat.T, (views.g - views.C @ before).flatten()
+    K, g, own = K - mean @ K - K @ mean + mean @ K @ mean, g - mean @ g, torch.arange(3 * count) % 3 > 0
+    expected = (g[own].square().sum() - K.diagonal()[own].sum()) / (math.sqrt(2.0) * K[own][:, own].norm())
+    assert views.score([1, 2]) == pytest.approx(float(expected), rel=1e-9)
+    theta_slope = views.joint.slope(theta).flatten()
+    torch.testing.assert_close(theta_slope, g + K @ theta.flatten())
+    most, nats = torch.tensor([0.0, 6.0, 6.0], dtype=torch.float64), []
+    for k in range(13):
+        wide = 2.0**-k * most.repeat(count)
+        inner = torch.eye(3 * count, dtype=torch.float64) + wide[:, None] * K * wide
+        nats.append(0.5 * float(wide * g @ torch.linalg.solve(inner, wide * g) - torch.logdet(inner)))
+    share = torch.tensor([math.log(4.0 * 13), *nats], dtype=torch.float64).softmax(0)[1:]
+    wanted = most * (share @ 4.0 ** -torch.arange(13.0, dtype=torch.float64)).sqrt()
+    torch.testing.assert_close(views.later(most), wanted, rtol=1e-3, atol=0.0)
     second = torch.arange(count) < 15
     parted = views_of(torch.where(second[:, None], 40.0 * theta.new_tensor([0.0, 1.0, -1.0]), 0.0))
     first, other = parted.best(second)[0]
     torch.testing.assert_close(first, -other)  # what is common is the camera's
     torch.testing.assert_close((other - first)[1:], theta.new_tensor([40.0, -40.0]), rtol=0.1, atol=0.0)
     assert int(((parted.by_group(second) < 0.0) != second).sum()) < 0.1 * count
+
+
+def test_what_many_views_show_is_gathered_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    result, none = calibrate_camera(capture()), torch.zeros(VIEWS, 3, dtype=torch.float64)
+    assert result.hybrid is not None
+    pixels = torch.where(result.residuals.isfinite(), result.observations.pixels(), torch.nan)
+    whole = module._of_fit(result.hybrid, pixels, none)
+    monkeypatch.setattr(module, "_TOGETHER", 5)
+    parts = module._of_fit(result.hybrid, pixels, none)
+    for name in ("N", "g", "C", "b"):
+        torch.testing.assert_close(getattr(parts, name), getattr(whole, name))
