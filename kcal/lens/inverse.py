@@ -278,9 +278,7 @@ def _follow_line(target_x: Tensor, target_y: Tensor, coefficients: Tensor, model
         # The places crowd at the end of the line, where a fold may be.
         t = 1.0 - (1.0 - k / steps) ** 2
         for _ in range(2):
-            lens = distort_components(x, y, coefficients, model)
-            error_x, error_y = lens.x - t * target_x, lens.y - t * target_y
-            next_x, next_y = newton_step(x, y, error_x, error_y, inverse_jacobian(lens.point))
+            next_x, next_y = _full_step(x, y, t * target_x, t * target_y, coefficients, model)
             usable = torch.isfinite(next_x + next_y)
             x, y = torch.where(usable, next_x, x), torch.where(usable, next_y, y)
     return x, y

@@ -106,7 +106,7 @@ class _ByView:
     g: Tensor
     C: Tensor
     b: Tensor
-    ties: tuple[int, ...]
+    ties: Sequence[int]
     begin: Tensor
 
     def lens(self, held: float = 1.0) -> _ByView:
@@ -388,7 +388,9 @@ def lenses_by_view(
             state, none = BoardState.flat(result.camera.params.detach(), *poses), pixels.new_zeros(len(used), _SIZE)
             problem = BoardProblem(result.board_points, pixels, result.camera.model, _INDICES)
             begin = _widths(seen.image_size)
-            views = _by_view(problem, state, max(result.noise, LEAST_NOISE), none, begin)
+            views = _by_view(
+                problem, state, max(result.noise, LEAST_NOISE), none, begin, none.new_zeros(len(problem.free))
+            )
             if _likeliest(views, _LENS).nats < WORTH:
                 return result
             own = CalibrationOptions(board=options.board, motion=options.motion, bending=options.bending)
@@ -699,9 +701,9 @@ def _of_fit(fit: HybridFit, pixels: Tensor, theta: Tensor) -> _ByView:
     deviation = torch.where(fit.half.any(0), fit.families.deviation(fit.expected), 0.0)
     # Numbers of one amplitude have the same logarithm.
     ties = _OTHER + by_number(np.arange(float(len(fit.log_ratio)))).unique(return_inverse=True)[1]
-    spread = (noise / fit.stillness.sqrt()).expand_as(state.motion)
     state = state._replace(board=theta.new_zeros(len(shapes)))
-    return _by_view(problem, state, noise, theta, begin, ties, spread, deviation)
+    spread = noise / fit.stillness.sqrt()
+    return _by_view(problem, state, noise, theta, begin, deviation, spread, tuple(ties.tolist()))
 
 
 def _by_view(
@@ -710,14 +712,13 @@ def _by_view(
     noise: float,
     theta: Tensor,
     begin: Tensor,
-    ties: Tensor | None = None,
-    spread: Tensor | None = None,
-    deviation: Tensor | None = None,
+    deviation: Tensor,
+    spread: Tensor | float = 1.0,
+    ties: Sequence[int] = (),
 ) -> _ByView:
-    """Of what a problem's views show; `deviation` (S,) of the priors of lens and board, zero or None where held."""
+    """Of what a problem's views show; `deviation` (S,) of the priors of lens and board, zero where held."""
     local, slots, motion = problem.local_size, problem.free.slots, state.motion
-    deviation = theta.new_zeros(problem.unknown_count) if deviation is None else deviation
-    spread = torch.ones_like(motion) if spread is None else spread
+    spread = torch.as_tensor(spread, dtype=torch.float64).expand_as(motion)
     grams, H = list[Tensor](), torch.eye(int((deviation > 0).sum()), dtype=torch.float64)
     for first in range(0, len(theta), _TOGETHER):
         views = slice(first, first + _TOGETHER)
@@ -738,7 +739,7 @@ def _by_view(
     x = torch.nn.functional.pad(x, (0, size - x.shape[1]))[..., None]
     g = gram[..., -1] - (N @ x)[..., 0]
     # There is no better lens and board than those of the state.
-    return _ByView(N, g, *_unit_weight(H, C, -(C.mT @ x)[..., 0]), () if ties is None else tuple(ties.tolist()), begin)
+    return _ByView(N, g, *_unit_weight(H, C, -(C.mT @ x)[..., 0]), ties, begin)
 
 
 def _felt(C: Tensor, widest: Tensor) -> Tensor:
