@@ -12,8 +12,8 @@ from torch import Tensor
 
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.result import HYBRID, NETWORK, CalibrationOptions, Progress
-from kcal.calibrate.camera.trust import held_out_squares
-from kcal.calibrate.problem.views import Views, whitening
+from kcal.calibrate.camera.trust import POSES, held_out_squares
+from kcal.calibrate.problem.views import Views, poses_under, whitening
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
 from kcal.gaussian import triangular
@@ -626,7 +626,8 @@ def compare_models(
             if covariances is not None and not weighted:
                 weights, weighted = whitening(covariances, 0.5 * found.rms**2), True
             test = Views(board_points=found.board_points, pixels=observations.pixels()[out], whitening=weights[out])
-            by_view, _ = held_out_squares(found.camera, test, judge)
+            solved = poses_under(found.camera, test, POSES)
+            by_view, _ = held_out_squares(found.camera, test, judge, *solved)
             for g in held:
                 costs[number, g] = by_view[[out.index(i) for i in members[g]]].sum()
     if not bool(costs.isfinite().any()) and failures:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from kcal.calibrate.camera.checks import stray_corners
+from kcal.calibrate.camera.each_view import LESS, SIZE, ByView, Spread, by_view
 from kcal.calibrate.camera.hybrid import few_views, fit_by_options, hybrid_result, lasting_findings
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, Progress
 from kcal.calibrate.camera.warnings import outlier_findings
@@ -27,7 +27,7 @@ from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding
 from kcal.gaussian import triangular
-from kcal.solve.schur import matrix_product, products_of, without_local
+from kcal.solve.schur import without_local
 from kcal.texts import number_text
 
 # A view's own scale and principal point, θ = (ln scale, cx, cy) off those of all views: of another camera or crop, of a
@@ -41,20 +41,15 @@ from kcal.texts import number_text
 
 # fx, fy, cx, cy among the parameters.
 _INDICES = (0, 1, 2, 3)
-_SIZE = 3
 # Which numbers share an amplitude, of θ and of three ways in which a board bends; -1: zero. A board that bends by view
 # is the rival: what it explains better is no matter of the lens.
 _NONE, _BENT = (-1,) * 6, (-1, -1, -1, 0, 0, 0)
 _LENS = ((-1, 0, 0, -1, -1, -1), (0, -1, -1, -1, -1, -1), (0, 1, 1, -1, -1, -1))
 # Of amplitudes of motions, of others than these.
 _OTHER = 10
-# Share of the variances of motions with which the search for amplitudes begins: a lens that moves was taken for motion.
-_LESS = 0.01
 # Standard deviations of a score from which amplitudes are asked for, and nats that these must be worth: of 18 simulated
 # captures of still lenses one had more, 3.7 and 3.1; those whose principal points moved by 15 px mostly 2.2 and 4.6.
 _ASKED, _SURE = 2.0, 4.0
-# Share of captures in which lenses are taken to move, before anything is known.
-_MOVING = 0.2
 # Share of its price that must be in sight before a camera is fitted again for two groups alone.
 _PROMISED = 0.7
 # Two values that gain a smaller share of what a spread of values does are not tried: where two cameras were true they
@@ -63,15 +58,8 @@ _BEHIND = 0.8
 # Widths of the prior of the difference between two groups: ln scale, and shares of the image's diagonal.
 _APART, _APART_CENTER = 0.1, 0.02
 # Rounds of refits; share of θ, and standard deviations of the camera, by which the last one changes it; the largest
-# share of a step of groups that the next one is taken to be; and steps of the search for amplitudes.
+# share of a step of groups that the next one is taken to be; and steps of the search for groups.
 _ROUNDS, _REST, _MOVED, _AHEAD, _STEPS = 12, 0.05, 0.2, 0.6, 60
-# Nats by which the last step of that search raises the evidence; shares of a variance to which one step may lead; and
-# the largest variance, in the widest ones that are expected.
-_SETTLED, _STEP, _MOST = 1e-2, (0.05, 4.0), 100.0
-# Views of which rows are in memory together.
-_TOGETHER = 256
-# Share of a unit, squared, that the widest movements change of combinations of lens and board that are left out.
-_UNFELT = 1e-3
 # What to do about a lens that moves.
 _STILL = "lock focus and zoom, switch the image stabilizer off (also in the camera's app), and photograph again"
 # Fewer views tell nothing; one view alone may be wrong otherwise, and a scale and principal point suits it.
@@ -79,207 +67,9 @@ _FEWEST, _FEWEST_OTHERS = 6, 2
 # Shares of the image's diagonal that corners of two groups must be apart, beyond which they are of two cameras; a lens
 # that focuses by itself scales images by one to three percent.
 _CERTAIN = 0.008
-# Share of the best known difference between groups, below which one is zero but for rounding.
-_ALIKE = 1e-10
 # Nats by which a view belongs to its group; standard deviations from which a difference is told, and χ² of two
 # numbers that agree.
 _CLEAR, _TOLD, _AGREE = 3.0, 3.0, 9.2
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _ByView:
-    """χ² by x of each view: its motion and bending over their deviations, θ, and how its board bends: 2 gᵀx + xᵀNx.
-
-    And by the lens and board of all views, y, in combinations of unit weight: 2 (b + Σ Cᵀx)ᵀ y + yᵀy. They would hide
-    a good part of what moves, were they held where one camera for all views has them.
-
-    Attributes:
-        N: (V, X, X).
-        g: (V, X).
-        C: (V, X, S).
-        b: (V, S), to be summed.
-        ties: which numbers of the motion and bending share an amplitude.
-        begin: (6,) standard deviations of the rest, larger than any, with which the search for amplitudes begins.
-    """
-
-    N: Tensor
-    g: Tensor
-    C: Tensor
-    b: Tensor
-    ties: Sequence[int]
-    begin: Tensor
-
-    def lens(self, held: float = 1.0) -> _ByView:
-        """By θ alone, motions integrated out, with this share of their variances; the board as it is."""
-        count = len(self.ties)
-        own, inner = slice(count, count + _SIZE), self.N[:, :count, :count]
-        rest = torch.cat([self.N[:, :count, own], self.g[:, :count, None], self.C[:, :count]], 2)
-        gone = torch.linalg.solve(inner + torch.eye(count, dtype=torch.float64) / held, rest)
-        left = torch.cat([self.N[:, own, own], self.g[:, own, None], self.C[:, own]], 2) - rest[..., :_SIZE].mT @ gone
-        shared = rest[..., _SIZE + 1 :].mT @ gone[..., _SIZE:]
-        N, g, C = left[..., :_SIZE], left[..., _SIZE], left[..., _SIZE + 1 :]
-        H = torch.eye(C.shape[-1], dtype=torch.float64) - shared[..., 1:].sum(0)
-        return _ByView(N, g, *_unit_weight(H, C, self.b - shared[..., 0]), (), self.begin[:_SIZE])
-
-    @functools.cached_property
-    def joint(self) -> _Joint:
-        """By θ off its mean, lens and board at their best."""
-        g, N, C = self.g - self.C @ self.b.sum(0), self.N, self.C - self.C.mean(0)
-        # The mean is that of the camera, which hardly anything but its prior tells from the lens.
-        one = torch.eye(_SIZE, dtype=torch.float64).expand_as(N)
-        off = (N - 0.5 * N.mean(0)) / len(N)
-        return _Joint(N, torch.cat([one, off, C], 2), torch.cat([off, one, C], 2), g - g.mean(0))
-
-    def score(self, own: list[int]) -> float:
-        """Standard deviations by which the slopes by these numbers of θ are steeper than by noise alone."""
-        N, F, G, g = self.joint
-        N, F, G = N[:, own][..., own], F[:, own], G[:, own]
-        noise = torch.einsum("vaa->", N) - (F * G).sum()
-        square = N.square().sum() - 2.0 * ((N @ F) * G).sum()
-        square += (products_of(F.flatten(0, 1).T) * products_of(G.flatten(0, 1).T)).sum()
-        return float((g[:, own].square().sum() - noise) / (2.0 * square).sqrt())
-
-    def later(self, most: Tensor) -> Tensor:
-        """(3,) root of the mean square of θ in views to come, by all deviations up to `most` (3,) and their evidence.
-
-        So it has room for the error of the likeliest deviation, and for a lens that moves though that is not proven.
-        Zeros where the evidence is against it.
-        """
-        N, F, G, g = self.joint
-        basis = _felt(F[..., 2 * _SIZE :], most)
-        F, G = (torch.cat([part[..., : 2 * _SIZE], part[..., 2 * _SIZE :] @ basis], 2) for part in (F, G))
-        squares, nats = 4.0 ** -torch.arange(0.0, 6.5, 0.5, dtype=g.dtype), list[Tensor]()
-        for root in squares.sqrt()[:, None] * most:
-            own = torch.eye(_SIZE, dtype=g.dtype) + root[:, None] * N * root
-            at = torch.linalg.solve(own, root[:, None] * torch.cat([F, g[..., None]], 2))
-            across = (root[:, None] * G).flatten(0, 1).T @ at.flatten(0, 1)
-            left = torch.eye(F.shape[2], dtype=g.dtype) - across[:, :-1]
-            gained = (root * g * at[..., -1]).sum()
-            gained += (root * g).flatten() @ at[..., :-1].flatten(0, 1) @ torch.linalg.solve(left, across[:, -1])
-            nats.append(0.5 * (gained - torch.logdet(own).sum() - torch.linalg.slogdet(left).logabsdet))
-        odds = math.log(_MOVING / (1.0 - _MOVING) / len(squares))
-        likely = torch.cat([g.new_zeros(1), odds + torch.stack(nats)]).softmax(0)
-        return most * (likely[1:] @ squares).sqrt() * (likely[0] < 1.0 - _MOVING)
-
-    def total(self, theta: Tensor) -> Tensor:
-        """(...) the change of χ² by θ (..., V, 3)."""
-        return ((self.joint.g + self.joint.slope(theta)) * theta).sum((-2, -1))
-
-    def best(self, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The best θ of both groups (..., 2, 3), its covariance (..., 6, 6), and by how many nats it is likelier (...).
-
-        `second` (..., V) tells which views are in the second group.
-        """
-        N, F, G, g = self.joint
-        groups, unit = torch.stack([~second, second], -2).to(g.dtype), self.begin[:_SIZE].repeat(2)
-        summed, of_F, of_G = ((groups @ part.flatten(1)).unflatten(-1, part.shape[1:]) for part in (N, F, G))
-        K = -of_F.flatten(-3, -2) @ of_G.flatten(-3, -2).mT
-        K.unflatten(-1, (2, -1)).unflatten(-3, (2, -1)).diagonal(dim1=-4, dim2=-2).add_(summed.movedim(-3, -1))
-        inverse = unit[:, None] * torch.linalg.pinv(unit[:, None] * K * unit, rtol=_ALIKE, hermitian=True) * unit
-        slope = (groups @ g).flatten(-2)
-        both = -(inverse @ slope[..., None])[..., 0]
-        return both.unflatten(-1, (2, _SIZE)), inverse, -0.5 * (slope * both).sum(-1)
-
-    def by_group(self, second: Tensor) -> Tensor:
-        """(..., V) of χ² with each view in the second group, less that with it in the first one."""
-        joint, both = self.joint, self.best(second)[0]
-        theta = torch.where(second[..., None], both[..., 1:, :], both[..., :1, :])
-        apart = both[..., 1, :] - both[..., 0, :]
-        bend = torch.einsum("...a,vab,...b->...v", apart, joint.N - joint.F @ joint.G.mT, apart)
-        return 2.0 * (joint.slope(theta) @ apart[..., None])[..., 0] + torch.where(second, -bend, bend)
-
-    def spread(self, tied: Sequence[int]) -> _Spread:
-        """Normal motions and others, whose amplitudes have the largest evidence; `tied` tells which are one.
-
-        Variances become the mean squares over the number of views that tell of them (MacKay, 1992), where that does not
-        raise the evidence, those of expectation maximization, which is safe and slow.
-        """
-        count, tied = len(self.ties), tied[: len(self.begin)]
-        ties = torch.tensor([*self.ties, *tied])
-        index = (ties >= 0).nonzero()[:, 0]
-        if not len(index):
-            zeros = self.g.new_zeros(len(self.g), len(tied))
-            return _Spread(0.0, zeros[:, 0], zeros[0], zeros)
-        N, g, one = self.N[:, index[:, None], index], self.g[:, index], torch.eye(len(index), dtype=torch.float64)
-        C, widest = self.C[:, index], torch.cat([self.g.new_ones(count), self.begin.square()])[index]
-        basis = _felt(C, widest.sqrt())
-        C, each_b = matrix_product(C, basis), self.b @ basis
-        b, free = each_b.sum(0), torch.eye(basis.shape[1], dtype=torch.float64)
-        share = (ties[index] == ties[index, None]).double()
-        share = share / share.sum(1)
-        variance = safe = share @ torch.where(index < count, _LESS, widest)
-        least, found = math.inf, (g[:, 0], variance, g)
-        for _ in range(_STEPS):
-            root = variance.sqrt()
-            inner = torch.linalg.cholesky(one + root[:, None] * N * root)
-            half = torch.linalg.solve_triangular(inner, torch.diag(root), upper=False)
-            by_shared, by_own = matrix_product(half, C), (half @ g[..., None])[..., 0]
-            flat = by_shared.flatten(0, 1)
-            M, unsolved = torch.linalg.cholesky_ex(free - products_of(flat.T))
-            y = -torch.cholesky_solve((b - flat.T @ by_own.flatten())[:, None], M)[:, 0]
-            mean = -(half.mT @ (by_own + by_shared @ y)[..., None])[..., 0]
-            nats = -0.5 * ((mean * g).sum(-1) + each_b @ (y + b)) - inner.diagonal(dim1=1, dim2=2).log().sum(1)
-            nats -= M.diagonal().log().sum() / len(nats)
-            loss = -float(nats.sum())
-            if unsolved or not loss <= least:
-                variance, least = safe, math.inf
-                continue
-            found, gained, least = (nats, root, mean), least - loss, loss
-            if gained < _SETTLED:
-                break
-            others = matrix_product(half.mT, by_shared).flatten(0, 1).T
-            others = torch.linalg.solve_triangular(M, others, upper=False).square().sum(0)
-            spread = share @ (half.square().sum(1) + others.view(mean.shape)).mean(0)
-            squares = share @ mean.square().mean(0)
-            safe, known = squares + spread, (variance - spread).clamp_min(1e-300)
-            variance = torch.minimum(variance * (squares / known).clamp(*_STEP), _MOST * widest)
-        nats, root, mean = found
-        sigma, each = N.new_zeros(len(ties)), N.new_zeros(len(N), len(ties))
-        sigma[index], each[:, index] = root, mean
-        # A second amplitude must be worth it, and a scale, by which a lens that is not quite as modeled seems to move.
-        paid = 0.5 * len(ties[index].unique()) * math.log(len(N)) + WORTH * (max(0, *tied) + (tied[0] >= 0))
-        return _Spread(float(nats.sum()) - paid, nats, sigma[count:][: len(tied)], each[:, count:])
-
-
-class _Joint(NamedTuple):
-    """χ² by θ of all views, 2 gᵀθ + θᵀKθ, K being block diagonal but for a matrix of low rank.
-
-    Attributes:
-        N: (V, 3, 3) of K = N - FGᵀ.
-        F: (V, 3, R).
-        G: (V, 3, R).
-        g: (V, 3).
-    """
-
-    N: Tensor
-    F: Tensor
-    G: Tensor
-    g: Tensor
-
-    def slope(self, theta: Tensor) -> Tensor:
-        """(..., V, 3) g + Kθ, of θ (..., V, 3)."""
-        shared = theta.flatten(-2) @ self.G.flatten(0, 1)
-        return self.g + (self.N @ theta[..., None])[..., 0] - (shared @ self.F.flatten(0, 1).T).view(theta.shape)
-
-
-class _Spread(NamedTuple):
-    """Numbers of all views that are normal about zero.
-
-    Attributes:
-        nats: by which they are likelier than zeros, the choice of amplitudes paid for.
-        by_view: (V,) nats of each view.
-        sigma: (X,) standard deviations.
-        mean: (V, X) of each view.
-    """
-
-    nats: float
-    by_view: Tensor
-    sigma: Tensor
-    mean: Tensor
-
-    def beyond(self, other: _Spread) -> float:
-        """Nats by which this is likelier than another one, without the view that tells most: it may be a wrong one."""
-        return self.nats - other.nats - float((self.by_view - other.by_view).max().clamp_min(0.0))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -385,10 +175,10 @@ def lenses_by_view(
         else:
             # Views of a parametric lens have no motion: the reference lens tells whether it is that.
             poses = result.cam_from_board_rotation[used], result.cam_from_board_translation[used]
-            state, none = BoardState.flat(result.camera.params.detach(), *poses), pixels.new_zeros(len(used), _SIZE)
+            state, none = BoardState.flat(result.camera.params.detach(), *poses), pixels.new_zeros(len(used), SIZE)
             problem = BoardProblem(result.board_points, pixels, result.camera.model, _INDICES)
             begin = _widths(seen.image_size)
-            views = _by_view(
+            views = by_view(
                 problem, state, max(result.noise, LEAST_NOISE), none, begin, none.new_zeros(len(problem.free))
             )
             if _likeliest(views, _LENS).nats < WORTH:
@@ -454,7 +244,7 @@ def own_lenses(
         progress: called after each further fit.
         theta: (V, 3) roughly what will be found, or None.
     """
-    views = _of_fit(fit, pixels, torch.zeros_like(pixels[:, 0, :1]).expand(-1, _SIZE))
+    views = _of_fit(fit, pixels, torch.zeros_like(pixels[:, 0, :1]).expand(-1, SIZE))
     if not bool(views.N.isfinite().all() and views.g.isfinite().all()):
         return None
     refits, about, nats = _Refits(fit, seen, pixels, options, progress), views.lens(), 0.0
@@ -471,7 +261,7 @@ def own_lenses(
         spreads = found.beyond(none) >= 0.0
     if not spreads:
         # Two values may be likelier where no spread is: motions that are held back do not hide the groups.
-        held = views.lens(_LESS)
+        held = views.lens(LESS)
         second = _grouped(held, held.spread(_LENS[-1]).mean, fit.size)
         if not _FEWEST_OTHERS <= int(second.sum()) <= len(second) - _FEWEST_OTHERS:
             return normal
@@ -479,7 +269,7 @@ def own_lenses(
             return normal
     else:
         for turn in range(_ROUNDS):
-            views = refits.with_own(found.mean[:, :_SIZE] if turn or theta is None else theta)
+            views = refits.with_own(found.mean[:, :SIZE] if turn or theta is None else theta)
             found = _likeliest(views, _LENS)
             if refits.rest:
                 break
@@ -489,14 +279,14 @@ def own_lenses(
         second = _grouped(about, found.mean, fit.size)
         if nats >= _SURE:
             # About the likeliest ones, no more than these are thinkable.
-            sigma = about.later(8.0 * found.sigma[:_SIZE])
+            sigma = about.later(8.0 * found.sigma[:SIZE])
             normal = OwnLenses(fit=refits.widened(sigma), sigma=sigma, theta=refits.theta, nats=nats)
             if about.best(second)[2] < _BEHIND * found.nats:
                 return normal
     return _two_cameras(refits, about, second, max(nats, 0.0)) or normal
 
 
-def _likeliest(views: _ByView, ways: Sequence[Sequence[int]]) -> _Spread:
+def _likeliest(views: ByView, ways: Sequence[Sequence[int]]) -> Spread:
     return max((views.spread(tied) for tied in ways), key=lambda spread: spread.nats)
 
 
@@ -508,7 +298,7 @@ class _Refits:
     ) -> None:
         self.first = self.fit = first
         self.seen, self.pixels, self.options, self.progress = seen, pixels, options, progress
-        self.theta, self.step, self.rest = pixels.new_zeros(len(pixels), _SIZE), math.inf, False
+        self.theta, self.step, self.rest = pixels.new_zeros(len(pixels), SIZE), math.inf, False
 
     @property
     def undone(self) -> Tensor:
@@ -516,7 +306,7 @@ class _Refits:
         center, theta = self.first.state.parameters[2:4], self.theta[:, None]
         return (self.pixels - center - theta[..., 1:]) * torch.exp(-theta[..., :1]) + center
 
-    def with_own(self, theta: Tensor, ahead: float = 0.0) -> _ByView:
+    def with_own(self, theta: Tensor, ahead: float = 0.0) -> ByView:
         """Fit with θ (V, 3) taken away; or with more of it, ahead of motions, which make way slowly."""
         theta, before = theta - theta.mean(0), self.fit
         step = (theta - self.theta) / _widths(before.size)
@@ -538,7 +328,7 @@ class _Refits:
         """The last fit with error bars that allow for θ, and for that of the next view."""
         return _widened(self._again(), self.undone, self.theta, sigma)
 
-    def nats(self, views: _ByView) -> float:
+    def nats(self, views: ByView) -> float:
         """By which the last fit is likelier than the first one, were θ zero in it."""
         fit, first = self.fit, self.first
         # Evidence of views that move is found before they are tempered.
@@ -549,21 +339,21 @@ class _Refits:
         return gained + 0.5 * float(views.total(self.theta)) - 2.0 * float((counts * self.theta[:, 0]).sum())
 
 
-def _parted(views: _ByView, second: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor, float]:
+def _parted(views: ByView, second: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor, float]:
     """The best θ of two groups (2, 3), the covariance (3, 3) of their difference, and the price of both in nats.
 
     The price is that of these numbers, and of a group for each view; `second` (V,) is one of them.
     """
     both, of_both, _ = views.best(second)
     sign = of_both.new_tensor([-1.0, 1.0])
-    covariance = torch.einsum("i,iajb,j->ab", sign, of_both.view(2, _SIZE, 2, _SIZE), sign)
+    covariance = torch.einsum("i,iajb,j->ab", sign, of_both.view(2, SIZE, 2, SIZE), sign)
     unit, share = _widths(size), float(second.double().mean())
-    known = torch.eye(_SIZE, dtype=torch.float64) + torch.linalg.pinv(covariance) * unit * unit[:, None]
+    known = torch.eye(SIZE, dtype=torch.float64) + torch.linalg.pinv(covariance) * unit * unit[:, None]
     mixed = -sum(part * math.log(part) for part in (share, 1.0 - share) if part > 0)
     return both, covariance, 0.5 * float(torch.logdet(known)) + 0.5 * math.log(len(second)) + len(second) * mixed
 
 
-def _grouped(views: _ByView, mean: Tensor, size: tuple[int, int]) -> Tensor:
+def _grouped(views: ByView, mean: Tensor, size: tuple[int, int]) -> Tensor:
     """(V,) the second of the two groups with which χ² falls most, from several starts; `mean` (V, 3) of single θ."""
     mean = mean / _widths(size)
     _, axes = torch.linalg.eigh(torch.cov(mean.T))
@@ -579,7 +369,7 @@ def _grouped(views: _ByView, mean: Tensor, size: tuple[int, int]) -> Tensor:
     return second[views.best(second)[2].argmax()]
 
 
-def _two_cameras(refits: _Refits, views: _ByView, second: Tensor, nats: float) -> OwnLenses | None:
+def _two_cameras(refits: _Refits, views: ByView, second: Tensor, nats: float) -> OwnLenses | None:
     """Two groups of views, if two values of θ are likelier than normal ones, which are by so many nats."""
     refits.step, before = math.inf, second
     for _ in range(_ROUNDS):
@@ -658,7 +448,7 @@ def _widened(fit: HybridFit, pixels: Tensor, theta: Tensor, sigma: Tensor) -> Hy
 
 def _for_later(fit: HybridFit, sigma: Tensor) -> HybridFit:
     """A fit with error bars that allow for θ of the next view, whose standard deviations (3,) these are."""
-    change, half = sigma.new_zeros(len(fit.information.slots), _SIZE), torch.zeros_like(fit.half)
+    change, half = sigma.new_zeros(len(fit.information.slots), SIZE), torch.zeros_like(fit.half)
     change[:2, 0], change[2, 1], change[3, 2] = fit.state.parameters[:2], 1.0, 1.0
     # Lenses of all frames have the same prior.
     known = fit.information.changed(change * sigma, prior=True)
@@ -692,68 +482,18 @@ def _evidence_at(fit: HybridFit, tempering: float) -> float:
     return -with_tempering(-fit.log_evidence, freedom, fit.sigma**2 / fit.tempering, own, tempering)
 
 
-def _of_fit(fit: HybridFit, pixels: Tensor, theta: Tensor) -> _ByView:
+def _of_fit(fit: HybridFit, pixels: Tensor, theta: Tensor) -> ByView:
     """Of a fit's views, about no motion and no θ; `theta` (V, 3) was taken away from the pixels."""
     # Errors that repeat within a view count less: a lens that does not quite fit is none that moves.
     shapes, noise = fit.board_shapes.shapes, max(fit.sigma, LEAST_NOISE)
     problem = _problem(fit, pixels, hybrid_unknowns(fit.model, fit.square), shapes)
-    begin, state = torch.cat([_widths(fit.size), _APART * fit.board_shapes.unit[:_SIZE]]), fit.state
+    begin, state = torch.cat([_widths(fit.size), _APART * fit.board_shapes.unit[:SIZE]]), fit.state
     deviation = torch.where(fit.half.any(0), fit.families.deviation(fit.expected), 0.0)
     # Numbers of one amplitude have the same logarithm.
     ties = _OTHER + by_number(np.arange(float(len(fit.log_ratio)))).unique(return_inverse=True)[1]
     state = state._replace(board=theta.new_zeros(len(shapes)))
     spread = noise / fit.stillness.sqrt()
-    return _by_view(problem, state, noise, theta, begin, deviation, spread, tuple(ties.tolist()))
-
-
-def _by_view(
-    problem: BoardProblem,
-    state: BoardState,
-    noise: float,
-    theta: Tensor,
-    begin: Tensor,
-    deviation: Tensor,
-    spread: Tensor | float = 1.0,
-    ties: Sequence[int] = (),
-) -> _ByView:
-    """Of what a problem's views show; `deviation` (S,) of the priors of lens and board, zero where held."""
-    local, slots, motion = problem.local_size, problem.free.slots, state.motion
-    spread = torch.as_tensor(spread, dtype=torch.float64).expand_as(motion)
-    grams, H = list[Tensor](), torch.eye(int((deviation > 0).sum()), dtype=torch.float64)
-    for first in range(0, len(theta), _TOGETHER):
-        views = slice(first, first + _TOGETHER)
-        rows = problem.corner_rows(state, views)
-        shared = rows[:, local:-1]
-        zoom = state.parameters[0] * shared[:, slots[0]]
-        if slots[1] != slots[0]:
-            zoom = zoom + state.parameters[1] * shared[:, slots[1]]
-        lens = torch.cat([zoom[:, None], shared[:, list(slots[2:4])]], 1)
-        own, bends = rows[:, POSE:local] * spread[views, :, None], shared[:, len(problem.free) :][:, :_SIZE]
-        shared, size = (shared * deviation[:, None])[:, deviation > 0], local - POSE + _SIZE + bends.shape[1]
-        off = without_local(torch.cat([rows[:, :POSE], own, lens, bends, shared, rows[:, -1:]], 1), POSE) / noise
-        grams.append(matrix_product(off[:, :size], off.mT))
-        H += products_of(off[:, size:-1].transpose(0, 1).flatten(1))
-    gram = torch.cat(grams)
-    N, C = gram[..., : (size := gram.shape[1])], gram[..., size:-1]
-    x = torch.cat([motion / spread.clamp_min(1e-30), theta], 1)
-    x = torch.nn.functional.pad(x, (0, size - x.shape[1]))[..., None]
-    g = gram[..., -1] - (N @ x)[..., 0]
-    # There is no better lens and board than those of the state.
-    return _ByView(N, g, *_unit_weight(H, C, -(C.mT @ x)[..., 0]), ties, begin)
-
-
-def _felt(C: Tensor, widest: Tensor) -> Tensor:
-    """(S, R) combinations of lens and board that the widest movements (X,) of views feel; C (V, X, S) are products."""
-    felt, basis = torch.linalg.eigh(products_of((C * widest[:, None]).flatten(0, 1).T))
-    return basis[:, felt > _UNFELT]
-
-
-def _unit_weight(H: Tensor, C: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """C (V, X, S) and b (V, S) by combinations of unit weight of unknowns whose products are H (S, S)."""
-    both = torch.cat([C, b[:, None]], 1)
-    flat = torch.linalg.solve_triangular(torch.linalg.cholesky(H), both.flatten(0, 1).T, upper=False)
-    both = flat.T.view(both.shape)
-    return both[:, :-1], both[:, -1]
+    return by_view(problem, state, noise, theta, begin, deviation, spread, tuple(ties.tolist()))
 
 
 def _widths(size: tuple[int, int]) -> Tensor:

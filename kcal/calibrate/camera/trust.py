@@ -22,7 +22,7 @@ from kcal.calibrate.camera.warnings import board_distances, corner_pupil, distan
 from kcal.calibrate.hybrid.fit import HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import hybrid_unknowns, moving_residuals
 from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.problem.views import Views, poses_under, refine_poses
+from kcal.calibrate.problem.views import Views, refine_poses
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
 from kcal.gaussian import half_of_covariance
@@ -44,7 +44,7 @@ from kcal.threads import in_one_thread
 FEWEST_IN_HALF = 6
 # Cells of the image over which residuals are averaged, and corners that each needs.
 _COLUMNS, _ROWS, _FEWEST_IN_CELL = 8, 6, 10
-_POSES = LMOptions(max_iterations=60, tolerance=1e-12)
+POSES = LMOptions(max_iterations=60, tolerance=1e-12)
 # RMS of corners that a half did not see over that of fitted ones: 1.01 to 1.19 in clean captures of 12 to 22 views, 1.5
 # to 2.1 with 5 coefficients on a wide lens (tuning seeds of scripts/check/verdict.py).
 PREDICTED = 1.25
@@ -273,25 +273,18 @@ def _compare(
     whole: CameraCalibrationResult | None = None,
 ) -> HalvesDifference:
     results = [_half(seen.subset(part), options, whole) for part in parts]
-    sums = torch.zeros(3, dtype=torch.float64)
-    corners = 0
+    sums, corners = torch.zeros(3, dtype=torch.float64), 0
     for fitted, other in (results, results[::-1]):
         views = Views(board_points=fitted.board_points, pixels=seen_pixels(other))
-        start = BoardState.flat(
-            fitted.camera.params.detach(), other.cam_from_board_rotation, other.cam_from_board_translation
-        )
-        squares, still = held_out_squares(fitted.camera, views, fitted.hybrid, start)
+        poses = other.cam_from_board_rotation, other.cam_from_board_translation
+        start = BoardState.flat(fitted.camera.params.detach(), *poses)
+        solved = refine_poses(views, fitted.camera.model, start, POSES)
+        squares, still = held_out_squares(fitted.camera, views, fitted.hybrid, *solved)
         sums += torch.stack([squares.sum(), other.residuals.square().nansum(), still.sum()])
         corners += int(other.residuals[..., 0].isfinite().sum())
     held_out, own, still_rms = (sums / corners).sqrt().tolist()
-    return HalvesDifference(
-        label=label,
-        alike=alike,
-        difference=camera_difference(results[0].camera, results[1].camera),
-        held_out=held_out,
-        own=own,
-        still=still_rms,
-    )
+    apart = camera_difference(results[0].camera, results[1].camera)
+    return HalvesDifference(label=label, alike=alike, difference=apart, held_out=held_out, own=own, still=still_rms)
 
 
 def _plain_lens(
@@ -309,16 +302,12 @@ def _plain_lens(
 
 
 def held_out_squares(
-    camera: Camera, views: Views, judge: HybridFit | None, start: BoardState | None = None
+    camera: Camera, views: Views, judge: HybridFit | None, poses: BoardState, cost: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """(V,) squared residuals of held-out views, with poses, and motions as of the judge's views, solved again.
+    """(V,) squared residuals of held-out views with solved poses, and with motions as of the judge's views.
 
-    Then with poses alone. Infinite where a view has no pose; `start` has poses that are nearly right, where known.
+    Then with poses alone, whose cost is (V,). Infinite where a view has no pose.
     """
-    if start is None:
-        poses, cost = poses_under(camera, views, _POSES)
-    else:
-        poses, cost = refine_poses(views, camera.model, start, _POSES)
     squares = torch.nan_to_num(2.0 * cost, nan=math.inf)
     if judge is None or judge.readout is None:
         return squares, squares

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from kcal.calibrate.camera import each_view
 from kcal.calibrate.camera import one_camera as module
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.result import CalibrationOptions
@@ -243,10 +244,10 @@ def test_amplitudes_from_quadratic_forms() -> None:
     C, H = root.mT @ shared, torch.eye(2, dtype=torch.float64) + (shared.mT @ shared).sum(0)
     begin = torch.tensor([0.1, 30.0, 30.0], dtype=torch.float64)
 
-    def views_of(theta: Tensor) -> module._ByView:
+    def views_of(theta: Tensor) -> each_view.ByView:
         left = (noise - shared @ y)[..., None] - root @ theta[..., None]
         g, b = (root.mT @ left)[..., 0], (shared.mT @ left)[..., 0]
-        return module._ByView(root.mT @ root, g, *module._unit_weight(H, C, b), (), begin)
+        return each_view.ByView(root.mT @ root, g, *each_view.unit_weight(H, C, b), (), begin)
 
     views, still = views_of(theta), views_of(torch.zeros_like(theta))
     center, scale = (views.spread(tied) for tied in module._LENS[:2])
@@ -256,7 +257,7 @@ def test_amplitudes_from_quadratic_forms() -> None:
     assert views.score([1, 2]) > 10.0 * abs(still.score([1, 2]))
     # Twelve views leave room for the error of their deviation, as Student's t does; two hundred still ones for nothing.
     none, each = views.b[:12, :0], 0.06 * (theta[:12] - theta[:12].mean(0)) + 0.25 * normal(12, 3)
-    few = module._ByView(
+    few = each_view.ByView(
         0.06 * torch.eye(3).double().expand(12, 3, 3), -each, none[:, None].expand(12, 3, 0), none, (), begin
     )
     found = few.spread(module._LENS[0])
@@ -267,8 +268,8 @@ def test_amplitudes_from_quadratic_forms() -> None:
         data = one + variance * few.N[:, 1:, 1:]
         gained = variance * few.g[:, None, 1:] @ torch.linalg.solve(data, few.g[:, 1:, None])
         all_nats.append(0.5 * float(gained.sum() - torch.logdet(data).sum()))
-    assert found.nats == pytest.approx(max(all_nats) - 0.5 * math.log(12), abs=2.0 * module._SETTLED)
-    assert all_nats[20] == pytest.approx(max(all_nats), abs=2.0 * module._SETTLED)
+    assert found.nats == pytest.approx(max(all_nats) - 0.5 * math.log(12), abs=2.0 * each_view._SETTLED)
+    assert all_nats[20] == pytest.approx(max(all_nats), abs=2.0 * each_view._SETTLED)
     assert 1.02 < float(few.later(8.0 * likely)[1] / likely[1]) < 1.1
     assert not bool(still.later(torch.tensor([0.0, 30.0, 30.0], dtype=torch.float64)).any())
     theta = theta - theta.mean(0)
@@ -304,7 +305,7 @@ def test_what_many_views_show_is_gathered_in_parts(monkeypatch: pytest.MonkeyPat
     assert result.hybrid is not None
     pixels = torch.where(result.residuals.isfinite(), result.observations.pixels(), torch.nan)
     whole = module._of_fit(result.hybrid, pixels, none)
-    monkeypatch.setattr(module, "_TOGETHER", 5)
+    monkeypatch.setattr(each_view, "_TOGETHER", 5)
     parts = module._of_fit(result.hybrid, pixels, none)
     for name in ("N", "g", "C", "b"):
         torch.testing.assert_close(getattr(parts, name), getattr(whole, name))
