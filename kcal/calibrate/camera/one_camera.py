@@ -48,8 +48,8 @@ _LENS = ((-1, 0, 0, -1, -1, -1), (0, -1, -1, -1, -1, -1), (0, 1, 1, -1, -1, -1))
 # Of amplitudes of motions, of others than these.
 _OTHER = 10
 # Standard deviations of a score from which amplitudes are asked for, and nats that these must be worth: of 18 simulated
-# captures of still lenses one had more, 3.7 and 3.1; those whose principal points moved by 15 px mostly 2.2 and 4.6. And
-# nats from which a camera is fitted again: those that were sure in the end began with 2 and more.
+# captures of still lenses one had more, 3.7 and 3.1; those whose principal points moved by 15 px mostly 2.2 and 4.6.
+# And nats from which a camera is fitted again: those that were sure in the end began with 2 and more.
 _ASKED, _SURE, _IN_SIGHT = 2.0, 4.0, 0.5
 # Share of its price that must be in sight before a camera is fitted again for two groups alone.
 _PROMISED = 0.7
