@@ -138,8 +138,8 @@ class ByView:
     def spread(self, tied: Sequence[int]) -> Spread:
         """Normal motions and others, whose amplitudes have the largest evidence; `tied` tells which are one.
 
-        Variances become the mean squares over the number of views that tell of them (MacKay, 1992), where that does not
-        raise the evidence, those of expectation maximization, which is safe and slow.
+        Variances become the mean squares over the number of views that tell of them (MacKay, 1992); where that lowers
+        the evidence, those of expectation maximization, which is safe and slow.
         """
         count, tied = len(self.ties), tied[: len(self.begin)]
         ties = torch.tensor([*self.ties, *tied])
