@@ -58,6 +58,8 @@ _PROMISED = 0.7
 _BEHIND = 0.8
 # Widths of the prior of the difference between two groups: ln scale, and shares of the image's diagonal.
 _APART, _APART_CENTER = 0.1, 0.02
+# Nats that two groups may still lack after a round of refits: further rounds gave 5 and less.
+_HOPELESS = 15.0
 # Rounds of refits; share of θ, and standard deviations of the camera, by which the last one changes it; the largest
 # share of a step of groups that the next one is taken to be; and steps of the search for groups.
 _ROUNDS, _REST, _MOVED, _AHEAD, _STEPS = 12, 0.05, 0.2, 0.6, 60
@@ -186,14 +188,16 @@ def lenses_by_view(
                 return result
             own = CalibrationOptions(board=options.board, motion=options.motion, bending=options.bending)
             fit = fit_by_options(seen, pixels, None, None, own, progress)
-        found = own_lenses(fit, seen, pixels, own, progress, theta)
         strays, wrong = stray_corners(fit.residuals), list[Finding]()
-        if found is not None and found.nats and bool(strays.any()):
+        doubtful = bool(strays.any())
+        found = own_lenses(fit, seen, pixels, own, progress, theta, briefly=doubtful)
+        if doubtful and found is not None and found.nats:
             wrong = outlier_findings(seen.names, fit.residuals, strays)
             # One wrong corner would make two cameras of the views.
             progress("again without corners that noise cannot explain")
             pixels, weights = pixels.masked_fill(strays[..., None], torch.nan), fit.weights.masked_fill(strays, 0.0)
-            found = own_lenses(fit_by_options(seen, pixels, weights, fit, own, progress), seen, pixels, own, progress)
+            fit = fit_by_options(seen, pixels, weights, fit, own, progress)
+            found = own_lenses(fit, seen, pixels, own, progress)
     except (InputError, DegenerateError, ArithmeticError, torch.linalg.LinAlgError):
         return result
     if found is None or (result.hybrid is None and not found.nats):
@@ -232,6 +236,7 @@ def own_lenses(
     options: CalibrationOptions,
     progress: Progress = lambda _: None,
     theta: Tensor | None = None,
+    briefly: bool = False,
 ) -> OwnLenses | None:
     """Scale and principal point of each view; None if all views have the same, or where nothing tells.
 
@@ -244,6 +249,8 @@ def own_lenses(
         options: with which they were fitted.
         progress: called after each further fit.
         theta: (V, 3) roughly what will be found, or None.
+        briefly: of a lens that moves, only by how much: not whether two cameras are likelier, and the error bars of
+            a single camera.
     """
     views = _of_fit(fit, pixels, torch.zeros_like(pixels[:, 0, :1]).expand(-1, SIZE))
     if not bool(views.N.isfinite().all() and views.g.isfinite().all()):
@@ -278,6 +285,8 @@ def own_lenses(
         found = _likeliest(about, _LENS)
         nats = found.nats + refits.nats(about)
         second = _grouped(about, found.mean, fit.size)
+        if nats >= _SURE and briefly:
+            return OwnLenses(fit=refits.fit, sigma=found.sigma[:SIZE], theta=refits.theta, nats=nats)
         if nats >= _SURE:
             # About the likeliest ones, no more than these are thinkable.
             sigma = about.later(8.0 * found.sigma[:SIZE])
@@ -380,17 +389,20 @@ def _two_cameras(refits: _Refits, views: ByView, second: Tensor, nats: float) ->
         ahead = _AHEAD if torch.equal(second, before) else 0.0
         views, before = refits.with_own(views.best(second)[0][second.long()], ahead).lens(), second
         moved = views.by_group(second) < 0.0
-        if refits.rest and torch.equal(moved, second):
+        done, second = refits.rest and torch.equal(moved, second), moved
+        both, covariance, price = _parted(views, second, refits.fit.size)
+        unlikely = (both[1] - both[0]) / _widths(refits.fit.size)
+        likelier = refits.nats(views) + float(views.best(second)[2] - 0.5 * unlikely.square().sum()) - price
+        if likelier < nats + WORTH - _HOPELESS:
+            return None
+        if done:
             break
-        second = moved
-    second = second if 2 * int(second.sum()) <= len(second) else ~second
-    fit = refits.fit
-    both, covariance, price = _parted(views, second, fit.size)
-    change = both[1] - both[0]
-    unlikely = change / _widths(fit.size)
-    likelier = refits.nats(views) + float(views.best(second)[2] - 0.5 * unlikely.square().sum()) - price
     if likelier < nats + WORTH:
         return None
+    if 2 * int(second.sum()) > len(second):
+        second = ~second
+        both, covariance, _ = _parted(views, second, refits.fit.size)
+    fit, change = refits.fit, both[1] - both[0]
     by_group = views.by_group(second)
     groups = TwoCameras(
         second=second,
