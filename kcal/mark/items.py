@@ -204,8 +204,7 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
     items, survey = dict(state.items), dict(state.survey)
     if isinstance(action, Load):
         items = {name: item for name, item in items.items() if item.kind not in action.kinds}
-        for name, (kind, left, right) in action.items.items():
-            items[name] = Item(kind=kind, left=left, right=right)
+        items |= {name: Item(kind=kind, left=left, right=right) for name, (kind, left, right) in action.items.items()}
     elif isinstance(action, Places | SurveyPlace):
         places = typed_places(action)
         survey |= places
@@ -224,17 +223,15 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
     elif isinstance(action, Put):
         items[action.name] = _with_mark(action, items[action.name])
     elif isinstance(action, Take):
-        items[action.name] = _item_with(_unmatched(items[action.name]), action.side, None)
+        items[action.name] = dataclasses.replace(_unmatched(items[action.name]), **{action.side: None})
     elif isinstance(action, Drop):
         del items[action.name]
     else:
         if action.to != action.name and action.to in items:
             raise InputError(f"the name {action.to!r} is used already; names must differ")
-        renamed = dataclasses.replace(items[action.name], kind=action.kind)
+        items[action.name] = dataclasses.replace(items[action.name], kind=action.kind)
         items = {action.to if name == action.name else name: value for name, value in items.items()}
-        items[action.to] = renamed
-        if action.name in survey:
-            survey = {action.to if name == action.name else name: value for name, value in survey.items()}
+        survey = {action.to if name == action.name else name: value for name, value in survey.items()}
     return MarkingState(items=items, survey=survey)
 
 
@@ -255,7 +252,7 @@ def _with_mark(action: Put, item: Item) -> Item:
     if action.matched and far is None:
         raise InputError(f"{action.name} has no mark in the other image to be matched with")
     cross = other_side(action.side) if action.matched else None
-    return dataclasses.replace(_item_with(_unmatched(item), action.side, _known_to(action)), cross=cross)
+    return dataclasses.replace(_unmatched(item), **{action.side: _known_to(action)}, cross=cross)
 
 
 def _known_to(action: Put) -> Mark:
@@ -267,10 +264,6 @@ def _known_to(action: Put) -> Mark:
     return action.mark.model_copy(update={"cov": (least**2, 0.0, least**2)})
 
 
-def _item_with(item: Item, side: Side, mark: Mark | None) -> Item:
-    return dataclasses.replace(item, left=mark) if side == "left" else dataclasses.replace(item, right=mark)
-
-
 def _unmatched(item: Item) -> Item:
     """The item with marks that stand alone: a matched one has the other's error besides its own."""
     if item.cross is None or item.left is None or item.right is None:
@@ -279,4 +272,4 @@ def _unmatched(item: Item) -> Item:
     side = other_side(item.cross)
     mark = item.mark(side)
     assert mark is not None
-    return dataclasses.replace(_item_with(item, side, mark.model_copy(update={"cov": total})), cross=None)
+    return dataclasses.replace(item, **{side: mark.model_copy(update={"cov": total})}, cross=None)
