@@ -9,18 +9,8 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
+import kcal.pipeline.measurements as many
 from kcal.errors import InputError
-from kcal.pipeline.measurements import (
-    Anchored,
-    congruent,
-    eliminate,
-    mahalanobis,
-    outer,
-    product,
-    rooted,
-    solved,
-    squared,
-)
 
 # Motion of targets: hovering, straight and turning models, and a state in which they stay linear at any range.
 #
@@ -104,7 +94,7 @@ def transition(numbers: Tensor, up: Tensor) -> Transition:
     x, y, z = up
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).unflatten(0, (3, 3))
-    along = outer(up, up)
+    along = many.outer(up, up)
     still = torch.eye(3, dtype=up.dtype, device=up.device)[..., None]
     # Of what is level, of its turn to the left, and of what is upright.
     parts = torch.stack([still - along, cross, along])[..., None, :]
@@ -122,11 +112,7 @@ def _noise_entries(motion: Motion, dt: float) -> tuple[float, float, float]:
     if k < 1e-3:
         return power * dt**3 / 3 * (1 - 0.75 * k), power * dt**2 / 2 * (1 - k), power * dt * (1 - k)
     tau, once, twice = motion.memory_s, -math.expm1(-k), -math.expm1(-2 * k)
-    return (
-        power * tau**3 * (k - 2 * once + twice / 2),
-        power * tau**2 * (once - twice / 2),
-        power * tau * twice / 2,
-    )
+    return (power * tau**3 * (k - 2 * once + twice / 2), power * tau**2 * (once - twice / 2), power * tau * twice / 2)
 
 
 class Moved(NamedTuple):
@@ -152,13 +138,13 @@ class Moved(NamedTuple):
         """The derivatives (6, 6, J, T) of the new state by the old one, times columns (6, C, J, T)."""
         ray = torch.cat([columns[:2], torch.zeros_like(columns[:1])])
         if self.turn is not None:
-            ray = product(self.turn, ray)
+            ray = many.product(self.turn, ray)
         if self.shift is not None:
-            ray = ray + outer(self.shift, columns[2])
-        carried = product(self.by_pace, columns[3:])
+            ray = ray + many.outer(self.shift, columns[2])
+        carried = many.product(self.by_pace, columns[3:])
         ray = ray + carried[:3]
         new = torch.cat([ray[:2], columns[2:3], carried[3:]])
-        return (new - outer(self.state, ray[2])) / self.ahead
+        return (new - many.outer(self.state, ray[2])) / self.ahead
 
 
 def moved(state: Tensor, step: Transition, turn: Tensor | None = None, shift: Tensor | None = None) -> Moved:
@@ -174,7 +160,7 @@ def moved(state: Tensor, step: Transition, turn: Tensor | None = None, shift: Te
     ray = torch.cat([state[:2], torch.ones_like(state[:1])])
     if turn is not None:
         rotation = turn[:, :, None]
-        reach, keep, ray = product(rotation, reach), product(rotation, keep), (rotation * ray).sum(1)
+        reach, keep, ray = many.product(rotation, reach), many.product(rotation, keep), (rotation * ray).sum(1)
     by_pace = torch.cat([reach, keep])
     carried = (by_pace * state[3:]).sum(1)
     ray = ray + carried[:3]
@@ -197,7 +183,7 @@ _LAST = torch.eye(6, dtype=torch.float64)[5, :, None, None]
 def _step_noise(new: Tensor, noise: Tensor) -> Tensor:
     """Isotropic noise of position and velocity in the new state's numbers, where 1 / z is one: (6, 6, J, T)."""
     fixed = (_BASIS.to(new) @ noise[..., 0]).unflatten(0, (6, 6))[..., None]
-    half = outer(new, 0.5 * noise[0] * new - noise[1] * _LAST.to(new))
+    half = many.outer(new, 0.5 * noise[0] * new - noise[1] * _LAST.to(new))
     return fixed + half + half.transpose(0, 1)
 
 
@@ -279,7 +265,7 @@ class Beliefs(NamedTuple):
         """One model with the same mean and covariance."""
         mean = self.middle
         apart = self.mean - mean
-        between = outer(self.weight * apart, apart).sum(-2, keepdim=True)
+        between = many.outer(self.weight * apart, apart).sum(-2, keepdim=True)
         columns, late = ((self.weight * value).sum(-2, keepdim=True) for value in (self.columns, self.late))
         return type(self)(mean, _with_noise(columns, between), late, torch.ones_like(self.weight[:1]))
 
@@ -301,7 +287,7 @@ class Beliefs(NamedTuple):
         mean = (share * self.mean[:, None]).sum(2)
         apart = self.mean[:, None] - mean[:, :, None]  # (6, to, from, T)
         columns, late = ((share * value.unsqueeze(-3)).sum(-2) for value in (self.columns, self.late))
-        return type(self)(mean, _with_noise(columns, outer(share * apart, apart).sum(-2)), late, weight)
+        return type(self)(mean, _with_noise(columns, many.outer(share * apart, apart).sum(-2)), late, weight)
 
 
 def no_beliefs(errors: int, clock_errors: int, models: int, device: torch.device) -> Beliefs:
@@ -331,7 +317,7 @@ def predicted(beliefs: Beliefs, step: Transition, turn: Tensor | None = None, sh
         return Beliefs(found.state, both, beliefs.late, beliefs.weight)
     # Velocities of earlier time steps are today's, turned back; a fading memory would let them grow without end. The
     # velocity in the state is divided by z, and z has changed by `ahead`.
-    keep = step.keep if turn is None else product(turn[:, :, None], step.keep)
+    keep = step.keep if turn is None else many.product(turn[:, :, None], step.keep)
     back = keep.transpose(0, 1) * (found.ahead / step.left)
     late = columns[:, width:].unflatten(1, beliefs.late.shape[1:3])
     late = (late[:, :, :, None] * back).sum(2)
@@ -341,7 +327,7 @@ def predicted(beliefs: Beliefs, step: Transition, turn: Tensor | None = None, sh
 def cross_covariance(before: Beliefs, after: Beliefs, step: Transition, turn: Tensor | None = None) -> Tensor:
     """(T, 6, 6) of the merged states before and after a prediction, for smoothing."""
     carried = moved(before.mean, step, turn).through(before.noise).transpose(0, 1)
-    apart = outer(before.mean - before.middle, after.mean - after.middle)
+    apart = many.outer(before.mean - before.middle, after.mean - after.middle)
     return (before.weight * (carried + apart)).sum(-2).movedim(-1, 0)
 
 
@@ -388,7 +374,7 @@ class Innovations(NamedTuple):
     marks: Tensor
 
 
-def innovations(beliefs: Beliefs, seen: Anchored, timing: Timing) -> Innovations:
+def innovations(beliefs: Beliefs, seen: many.Anchored, timing: Timing) -> Innovations:
     """Compare beliefs with sightings, one for each track.
 
     Args:
@@ -407,16 +393,16 @@ def innovations(beliefs: Beliefs, seen: Anchored, timing: Timing) -> Innovations
         by_camera = by_rates(own[which], beliefs.mean)
         late.append(by_camera[:, None, 3:] * timing.clock[which, :, None, None])
         # The product of two unknowns, a rate and a delay, is noise of second order.
-        marks = marks + congruent(timing.unsure[which] * by_camera, beliefs.noise)
+        marks = marks + many.congruent(timing.unsure[which] * by_camera, beliefs.noise)
     shared = seen.shared[:, :, None]
     all_late = torch.cat(late, 1) if late else slope.new_zeros(len(value), 0, 3, *slope.shape[2:])
-    carried = product(slope, beliefs.columns)
+    carried = many.product(slope, beliefs.columns)
     crossed = carried[:, :6]
     by_clock = all_late
     if late:
-        by_clock = all_late + product(slope, beliefs.late.flatten(1, 2)).unflatten(1, all_late.shape[1:3])
+        by_clock = all_late + many.product(slope, beliefs.late.flatten(1, 2)).unflatten(1, all_late.shape[1:3])
     effect = _effect(shared + carried[:, 6:], by_clock, beliefs.mean[3:])
-    noise = product(crossed, slope.transpose(0, 1)) + marks
+    noise = many.product(crossed, slope.transpose(0, 1)) + marks
     return Innovations(value, slope, shared, all_late, effect, crossed, noise, marks.expand_as(noise))
 
 
@@ -429,12 +415,12 @@ class Fit(NamedTuple):
 
 def _whole(found: Innovations, root: Tensor | None) -> Tensor:
     """(M, M, J, N) covariance of innovations, with all errors."""
-    return found.noise + squared(rooted(found.effect, root))
+    return found.noise + many.squared(many.rooted(found.effect, root))
 
 
 def fit_of(found: Innovations, root: Tensor | None) -> Fit:
     """Judge innovations with all errors: the covariance of b is root rootᵀ, or the identity."""
-    distance, volume = mahalanobis(_whole(found, root), found.value)
+    distance, volume = many.mahalanobis(_whole(found, root), found.value)
     return Fit(distance, -0.5 * (distance + volume))
 
 
@@ -443,45 +429,45 @@ def updated(beliefs: Beliefs, found: Innovations, root: Tensor | None) -> Belief
     models, still = len(beliefs.weight), torch.eye(len(found.value)).to(found.value)[..., None, None]
     columns = torch.cat([found.crossed, found.value[:, None], still.expand_as(found.noise)], 1)
     # Both at once: of the noise alone, and of all.
-    done = eliminate(torch.cat([found.noise, _whole(found, root)], 2), columns.repeat(1, 1, 2, 1))
+    done = many.eliminate(torch.cat([found.noise, _whole(found, root)], 2), columns.repeat(1, 1, 2, 1))
     white = done.columns / done.pivots[:, None]
-    gain = product(white[:, :6, :models].transpose(0, 1), done.columns[:, 7:, :models])
+    gain = many.product(white[:, :6, :models].transpose(0, 1), done.columns[:, 7:, :models])
     pivots = done.pivots[:, models:]
     distance = (done.columns[:, 6, models:] * white[:, 6, models:]).sum(0)
     mean = beliefs.mean + (gain * found.value).sum(1)
-    rest = torch.eye(6, dtype=mean.dtype, device=mean.device)[..., None, None] - product(gain, found.slope)
-    columns = product(rest, beliefs.columns)
+    rest = torch.eye(6, dtype=mean.dtype, device=mean.device)[..., None, None] - many.product(gain, found.slope)
+    columns = many.product(rest, beliefs.columns)
     # Joseph's form: symmetric and positive whatever the rounding.
-    noise = product(columns[:, :6], rest.transpose(0, 1)) + congruent(gain, found.marks)
-    columns = torch.cat([noise, columns[:, 6:] - product(gain, found.shared)], 1)
+    noise = many.product(columns[:, :6], rest.transpose(0, 1)) + many.congruent(gain, found.marks)
+    columns = torch.cat([noise, columns[:, 6:] - many.product(gain, found.shared)], 1)
     late = beliefs.late
     if late.shape[1]:
-        moved = product(rest, late.flatten(1, 2)) - product(gain, found.late.flatten(1, 2))
+        moved = many.product(rest, late.flatten(1, 2)) - many.product(gain, found.late.flatten(1, 2))
         late = moved.unflatten(1, late.shape[1:3])
     log = beliefs.weight.log() - 0.5 * (distance + pivots.log().sum(0))
     return Beliefs(mean, columns, late, torch.softmax(log, 0).clamp_min(1e-12))
 
 
-def born(seen: Anchored, timing: Timing, speed: float, models: int) -> Beliefs:
+def born(seen: many.Anchored, timing: Timing, speed: float, models: int) -> Beliefs:
     """Beliefs from one sighting each, with velocities of zero and a standard deviation of `speed` along each axis."""
     slope = seen.late.sum(0)
-    normal = product(slope.transpose(0, 1), slope)
+    normal = many.product(slope.transpose(0, 1), slope)
     still = torch.eye(3, dtype=slope.dtype, device=slope.device)[..., None]
-    spread = solved(eliminate(normal, still.expand_as(normal)))
-    gain = product(spread, slope.transpose(0, 1))  # (3, M, N)
+    spread = many.solved(many.eliminate(normal, still.expand_as(normal)))
+    gain = many.product(spread, slope.transpose(0, 1))  # (3, M, N)
     place = seen.place + (gain * seen.value).sum(1)
     state = torch.cat([place, torch.zeros_like(place)])
-    late = by_rates(product(gain, (seen.late * timing.delay[:, None, None]).sum(0)), state)[:, 3:]
+    late = by_rates(many.product(gain, (seen.late * timing.delay[:, None, None]).sum(0)), state)[:, 3:]
     # The range is hardly known at first, but a speed per meter of range must not vanish.
     drift = speed**2 * (place[2].square() + spread[2, 2])
-    here, by_clock = spread + drift * squared(late), []
+    here, by_clock = spread + drift * many.squared(late), []
     for which in range(len(timing.clock)):
-        by_camera = by_rates(product(gain, seen.late[1 + which]), state)[:, 3:]
-        here = here + drift * timing.unsure[which].square() * squared(by_camera)
+        by_camera = by_rates(many.product(gain, seen.late[1 + which]), state)[:, 3:]
+        here = here + drift * timing.unsure[which].square() * many.squared(by_camera)
         by_clock.append(by_camera[:, None] * timing.clock[which, :, None])
     pace, both = still * drift, -drift * late
     noise = torch.cat([torch.cat([here, both], 1), torch.cat([both.transpose(0, 1), pace], 1)])
-    shared = torch.nn.functional.pad(product(gain, seen.shared), (0, 0, 0, 0, 0, 3))
+    shared = torch.nn.functional.pad(many.product(gain, seen.shared), (0, 0, 0, 0, 0, 3))
     clocks = torch.cat(by_clock, 1) if by_clock else state.new_zeros(3, 0, *late.shape[1:])
     clocks = torch.nn.functional.pad(-clocks, (0, 0, 0, 0, 0, 0, 0, 3))
     columns = torch.cat([noise, -shared], 1)
