@@ -335,8 +335,9 @@ class Detections:
     def select(self, chosen: Tensor) -> Detections:
         """Those that a mask (N,) or a list of numbers chooses."""
         numbers = chosen.nonzero()[:, 0] if chosen.dtype == torch.bool else chosen
-        texts = {name: tuple(getattr(self, name)[i] for i in numbers.tolist()) for name in ("category", "track")}
-        return dataclasses.replace(self, **self._each(lambda value: value[numbers]), **texts)
+        category = tuple(self.category[i] for i in numbers.tolist())
+        track = tuple(self.track[i] for i in numbers.tolist())
+        return dataclasses.replace(self, **self._each(lambda value: value[numbers]), category=category, track=track)
 
     def anchors(self, anchor: Anchor = "center") -> Tensor:
         """Pixels (N, 2) that stand for the objects.
