@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import threading
 from collections import OrderedDict
@@ -187,8 +188,7 @@ def propose(rig: Rig, images: tuple[Gray, Gray], side: Side, u: float, v: float,
         return Proposal(str(error))
     covariance, (at_u, at_v) = found.covariance[0], found.pixels[0].tolist()
     proposal = Proposal("", at_u, at_v, three_of(covariance), float(found.score[0]), float(found.off_line[0]))
-    if int(again.status[0]) != MatchStatus.GOOD:
-        status = MatchStatus(int(again.status[0]))
+    if (status := MatchStatus(int(again.status[0]))) != MatchStatus.GOOD:
         return proposal._replace(refusal=f"{_REFUSALS[status]} (on the way back)")
     miss = float(torch.linalg.vector_norm(again.pixels[0] - start[0]))
     limit = _BACK_PX + _BACK_SIGMAS * math.sqrt(float(covariance.diagonal().max()))
@@ -293,10 +293,7 @@ class Pyramid:
 
 def top_level(shape: tuple[int, ...]) -> int:
     """The level at which the image fits one tile."""
-    level = 0
-    while max(shape) >> level > TILE:
-        level += 1
-    return level
+    return next(level for level in itertools.count() if max(shape) >> level <= TILE)
 
 
 def _is_gray(image: Gray) -> bool:

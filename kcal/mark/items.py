@@ -204,8 +204,7 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
     items, survey = dict(state.items), dict(state.survey)
     if isinstance(action, Load):
         items = {name: item for name, item in items.items() if item.kind not in action.kinds}
-        for name, (kind, left, right) in action.items.items():
-            items[name] = Item(kind=kind, left=left, right=right)
+        items |= {name: Item(kind=kind, left=left, right=right) for name, (kind, left, right) in action.items.items()}
     elif isinstance(action, Places | SurveyPlace):
         places = typed_places(action)
         survey |= places
@@ -230,11 +229,9 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
     else:
         if action.to != action.name and action.to in items:
             raise InputError(f"the name {action.to!r} is used already; names must differ")
-        renamed = dataclasses.replace(items[action.name], kind=action.kind)
+        items[action.name] = dataclasses.replace(items[action.name], kind=action.kind)
         items = {action.to if name == action.name else name: value for name, value in items.items()}
-        items[action.to] = renamed
-        if action.name in survey:
-            survey = {action.to if name == action.name else name: value for name, value in survey.items()}
+        survey = {action.to if name == action.name else name: value for name, value in survey.items()}
     return MarkingState(items=items, survey=survey)
 
 

@@ -122,9 +122,8 @@ def solve_live(cameras: tuple[Camera, Camera], survey: Survey | None, marks: Mar
 
 def near_sigma(marks: Marks, hand_sigma: float) -> float:
     """The typical sigma of marks that are made from near, px: none of them is worse than one by hand."""
-    return marks._replace(covariance=None, sigma=marks.sigmas(hand_sigma).clamp_max(hand_sigma)).typical_sigma(
-        hand_sigma
-    )
+    near = marks._replace(covariance=None, sigma=marks.sigmas(hand_sigma).clamp_max(hand_sigma))
+    return near.typical_sigma(hand_sigma)
 
 
 def promised(rig: Rig, sigma: float) -> tuple[Promise, ...]:

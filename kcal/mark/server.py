@@ -50,8 +50,7 @@ def marking_app(desk: Desk, token: str, hosts: tuple[str, ...]) -> Starlette:
     ) -> Response:  # fmt: skip
         """A tile; `low` and `high` stretch deep images."""
         span = None if low is None or high is None else (low, high)
-        part = desk.pictures.pyramid(side, frame).tile(level, x, y, span)
-        return pixels(part)
+        return pixels(desk.pictures.pyramid(side, frame).tile(level, x, y, span))
 
     def pixels(levels: NDArray[np.uint8], **more: int) -> Response:
         """Levels of 8 bits, (H, W) or (H, W, 3), row by row."""

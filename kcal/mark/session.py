@@ -22,6 +22,7 @@ from kcal.lens.rig import Origin
 from kcal.locate.marks import Marks, marks_text, read_marks
 from kcal.locate.survey import EARTH, LOCAL, PLACE_COLUMNS, places_csv, read_survey
 from kcal.locate.tables import TableRow, header_of, read_rows
+from kcal.mark.shapes import three_of
 
 # The undo log: every action is one line of a file, written through to the disk before it is answered.
 #
@@ -124,9 +125,8 @@ class Journal:
         self, action: marking.Change | marking.Step
     ) -> tuple[list[marking.MarkingState], list[marking.MarkingState]]:
         if isinstance(action, marking.Places):
-            return [marking.applied(state, action) for state in self._states], [
-                marking.applied(s, action) for s in self._undone
-            ]
+            states, undone = ([marking.applied(one, action) for one in each] for each in (self._states, self._undone))
+            return states, undone
         if not isinstance(action, marking.Step):
             return [*self._states, marking.applied(self.state, action)], []
         if action.do == "undo":
@@ -422,19 +422,16 @@ class Session:
     def _load(self, marks: Marks, kinds: tuple[marking.Kind, ...]) -> marking.Load:
         items: dict[str, tuple[marking.Kind, marking.Mark | None, marking.Mark | None]] = {}
         covariance = marks.covariance_or(self.hand_sigma)
+        if covariance is None:
+            covariance = (self.hand_sigma**2 * torch.eye(4, dtype=torch.float64)).expand(len(marks.names), 4, 4)
         for row, name in enumerate(marks.names):
             old = self.state.items.get(name)
             kind: marking.Kind = old.kind if old is not None and old.kind in kinds else kinds[-1]
-            both = []
-            for side, pixel in enumerate((marks.left[row], marks.right[row])):
-                block = (
-                    self.hand_sigma**2 * torch.eye(2, dtype=torch.float64)
-                    if covariance is None
-                    else covariance[row, 2 * side : 2 * side + 2, 2 * side : 2 * side + 2]
-                )
-                cov = (float(block[0, 0]), float(block[0, 1]), float(block[1, 1]))
-                seen = bool(torch.isfinite(pixel).all())
-                both.append(marking.Mark(u=float(pixel[0]), v=float(pixel[1]), cov=cov, how="file") if seen else None)
+            both: list[marking.Mark | None] = [None, None]
+            for side, (u, v) in enumerate((marks.left[row].tolist(), marks.right[row].tolist())):
+                if math.isfinite(u) and math.isfinite(v):
+                    cov = three_of(covariance[row, 2 * side :, 2 * side :])
+                    both[side] = marking.Mark(u=u, v=v, cov=cov, how="file")
             items[name] = (kind, both[0], both[1])
         # Landmarks without marks stay where they are.
         for name, item in self.state.items.items():
@@ -481,9 +478,7 @@ def pair_covariance(item: marking.Item) -> Tensor:
 
 def _write_if_new(path: Path, text: str) -> None:
     """Write a file atomically unless it has this content."""
-    try:
+    with contextlib.suppress(OSError, UnicodeDecodeError):
         if path.read_text(encoding="utf-8") == text:
             return
-    except (OSError, UnicodeDecodeError):
-        pass
     write_atomic(path, text)

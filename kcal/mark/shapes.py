@@ -194,7 +194,7 @@ def improve(
     """Least squares from one start (P,); `whiten` makes the errors of columns (N, K) independent and of equal size."""
     residual = _whitened_residual(shape, where, levels, whiten)
     low, high = np.array([-6.0, -6.0, *shape.low]), np.array([6.0, 6.0, *shape.high])
-    _, best = _minimized(residual, start, low, high, iterations)
+    best = _minimized(residual, start, low, high, iterations)
     return _described(shape, best, residual, weight, whiten(levels[:, None])[:, 0])
 
 
@@ -223,7 +223,7 @@ def starts_at(shape: ShapeModel, points: Floats) -> Floats:
 
 def _minimized(
     residual: Callable[[Floats], Floats], start: Floats, low: Floats, high: Floats, iterations: int
-) -> tuple[float, Floats]:
+) -> Floats:
     """Levenberg-Marquardt with slopes by differences; parameters stay inside their bounds."""
     p, damping = np.clip(start, low, high), 1e-3
     r = residual(p)
@@ -247,7 +247,7 @@ def _minimized(
         p, r = moved, there
         if settled:
             break
-    return cost, p
+    return p
 
 
 def slopes(residual: Callable[[Floats], Floats], p: Floats, r: Floats) -> Floats:
@@ -342,11 +342,9 @@ def fit_before_texture(shape: ShapeModel, fit: ShapeFit, where: Floats, levels: 
         return solve_triangular(half, columns, lower=True, check_finite=False)
 
     again = improve(shape, fit.parameters, where, levels, np.ones(len(where)), whiten)
-    return (
-        fit
-        if again is None
-        else fit._replace(parameters=again.parameters, point=again.point, covariance=again.covariance)
-    )
+    if again is None:
+        return fit
+    return fit._replace(parameters=again.parameters, point=again.point, covariance=again.covariance)
 
 
 def texture_of(where: Floats, left_over: Floats, unknowns: Floats) -> Texture:

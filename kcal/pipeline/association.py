@@ -392,13 +392,9 @@ class PairBoxes(StatedModule):
         if torch.compiler.is_compiling():
             # As a decorator it would load the compiler, 1.6 s, in every program that pairs boxes.
             return torch.compiler.disable(self.forward)(left, right, mask_left, mask_right, kinds=kinds, images=images)
-        sides = [
-            _sound_boxes(f"{word} boxes", boxes, mask, camera.size)
-            for word, boxes, mask, camera in (
-                ("left", left, mask_left, self.rig.left), ("right", right, mask_right, self.rig.right)
-            )
-        ]  # fmt: skip
-        boxes, masks = zip(*sides, strict=True)
+        first = _sound_boxes("left boxes", left, mask_left, self.rig.left.size)
+        second = _sound_boxes("right boxes", right, mask_right, self.rig.right.size)
+        boxes, masks = zip(first, second, strict=True)
         if len(left) != len(right):
             raise InputError(f"boxes of {len(left)} left and {len(right)} right images; as many of both are needed")
         near = masks[0][..., None] & masks[1][:, None]

@@ -94,11 +94,8 @@ def _from_array(source: Any) -> Raw:
         raise InputError(
             f"detections: shape (N, 4) to (N, 6) of x1, y1, x2, y2, score, class is needed, got {tuple(table.shape)}"
         )
-    return dict(
-        boxes=table[:, :4],
-        score=table[:, 4] if table.shape[1] > 4 else None,
-        category=table[:, 5].tolist() if table.shape[1] > 5 else None,
-    )
+    score, category = [*table.T[4:], None, None][:2]
+    return dict(boxes=table[:, :4], score=score, category=None if category is None else category.tolist())
 
 
 def _from_dict(source: Mapping[str, Any]) -> Raw:
@@ -128,12 +125,10 @@ def _from_json(source: str | bytes) -> Raw:
         raise InputError(f"detections: size must be [width, height], got {size}")
     if time is not None and type(time) not in (int, float):
         raise InputError(f"detections: time must be seconds, got {time!r}")
-    categories = line.get("categories")
-    if categories is not None and not (
-        isinstance(categories, list) and all(isinstance(name, (str, int)) for name in categories)
-    ):
+    categories, tracks = line.get("categories"), line.get("tracks")
+    listed = isinstance(categories, list) and all(isinstance(name, (str, int)) for name in categories)
+    if categories is not None and not listed:
         raise InputError(f"detections: categories must be a list of names or numbers, got {categories!r}")
-    tracks = line.get("tracks")
     if tracks is not None and not isinstance(tracks, list):
         raise InputError(f"detections: tracks must be a list, got {tracks!r}")
     return dict(
@@ -149,13 +144,11 @@ def _from_json(source: str | bytes) -> Raw:
 
 def _from_supervision(source: Any) -> Raw:
     """`supervision.Detections`; class names come from its `data`."""
-    names = (source.data or {}).get("class_name")
-    category = names if names is not None else source.class_id
-    masks = source.mask
+    names, masks = (source.data or {}).get("class_name"), source.mask
     return dict(
         boxes=_boxes(source.xyxy),
         score=_optional(source.confidence, "confidence"),
-        category=_plain_list(category),
+        category=_plain_list(source.class_id if names is None else names),
         track=_plain_list(source.tracker_id),
         masks=None if masks is None else torch.from_numpy(np.asarray(masks, dtype=bool)),
         size=None if masks is None else (masks.shape[2], masks.shape[1]),
@@ -164,22 +157,18 @@ def _from_supervision(source: Any) -> Raw:
 
 def _from_ultralytics(source: Any) -> Raw:
     """One `Results` of ultralytics, or what has the same attributes; its boxes are in the original image."""
-    boxes = source.boxes
-    height, width = source.orig_shape[:2]
-    keypoints = getattr(source, "keypoints", None)
-    masks = getattr(source, "masks", None)
-    whole = None
-    if masks is not None:
-        whole = torch.as_tensor(masks.data) > 0.5
-        if tuple(whole.shape[1:]) != (height, width):
-            whole = None  # in the letterboxed input: to be read with retina_masks=True
+    boxes, (height, width) = source.boxes, source.orig_shape[:2]
+    keypoints, masks = (getattr(source, name, None) for name in ("keypoints", "masks"))
+    tracks = getattr(boxes, "id", None)
+    whole = None if masks is None else torch.as_tensor(masks.data) > 0.5
     return dict(
         boxes=_boxes(boxes.xyxy),
         score=_optional(boxes.conf, "conf"),
         category=_plain_list(boxes.cls),
-        track=_plain_list(None if getattr(boxes, "id", None) is None else [int(i) for i in boxes.id]),
+        track=None if tracks is None else [int(i) for i in tracks],
         keypoints=None if keypoints is None else _as_numbers("keypoints", keypoints.xy),
-        masks=whole,
+        # Others are in the letterboxed input: to be read with retina_masks=True.
+        masks=whole if whole is not None and tuple(whole.shape[1:]) == (height, width) else None,
         size=(int(width), int(height)),
         names=source.names if isinstance(source.names, dict) else dict(enumerate(source.names)),
     )
@@ -335,24 +324,20 @@ class Detections:
             time=raw.get("time") if time is None else time,
         )
 
+    def _each(self, change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+        own = {name: getattr(self, name) for name in ("boxes", "score", "keypoints", "masks")}
+        return {name: change(value) for name, value in own.items() if value is not None}
+
     def to(self, device: torch.device | str) -> Detections:
         """The same on another device, in the same graph."""
-        own = {name: getattr(self, name) for name in ("boxes", "score", "keypoints", "masks")}
-        moved = {name: value.to(device) for name, value in own.items() if value is not None}
-        return dataclasses.replace(self, **moved)
+        return dataclasses.replace(self, **self._each(lambda value: value.to(device)))
 
     def select(self, chosen: Tensor) -> Detections:
         """Those that a mask (N,) or a list of numbers chooses."""
         numbers = chosen.nonzero()[:, 0] if chosen.dtype == torch.bool else chosen
-        return dataclasses.replace(
-            self,
-            boxes=self.boxes[numbers],
-            score=self.score[numbers],
-            category=tuple(self.category[i] for i in numbers.tolist()),
-            track=tuple(self.track[i] for i in numbers.tolist()),
-            keypoints=None if self.keypoints is None else self.keypoints[numbers],
-            masks=None if self.masks is None else self.masks[numbers],
-        )
+        category = tuple(self.category[i] for i in numbers.tolist())
+        track = tuple(self.track[i] for i in numbers.tolist())
+        return dataclasses.replace(self, **self._each(lambda value: value[numbers]), category=category, track=track)
 
     def anchors(self, anchor: Anchor = "center") -> Tensor:
         """Pixels (N, 2) that stand for the objects.

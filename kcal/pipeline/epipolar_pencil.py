@@ -98,16 +98,13 @@ def meetings(lines: StationSights, rows: Ints, others: Ints, gate: float, neares
         >>> found.second.tolist(), (found.point.round(6) + 0.0).tolist()
         ([1], [[0.0, 800.0, 0.0]])
     """
-    none = Meetings(*(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 3)), *(np.zeros(0),) * 3)
-    if not len(rows) or not len(others):
-        return none
-    a, b = int(lines.camera[rows[0]]), int(lines.camera[others[0]])
+    first, second = near_in_angle(lines, rows, others, gate, nearest)
+    if not len(first):
+        return Meetings(first, second, np.zeros((0, 3)), *(np.zeros(0),) * 3)
+    a, b = int(lines.camera[first[0]]), int(lines.camera[second[0]])
     shift = lines.center[b] - lines.center[a]
     length = float(np.linalg.norm(shift))
-    if not length:
-        return none
     base = shift / length
-    first, second = near_in_angle(lines, rows, others, gate, nearest)
     u, v = lines.ray[first], lines.ray[second]
     near, far = _ranges(u, v, base, length)
     good = (near > 0) & (far > 0) & (near < FARTHEST_BEND_M) & (far < FARTHEST_BEND_M)

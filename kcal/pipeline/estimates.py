@@ -205,9 +205,8 @@ class History:
         for place, key in enumerate(keys):
             which = torch.tensor([place], device=frame.device)
             prior, cross = self._priors.get(key, (None, None))
-            if prior is not None:
-                # The sightings of this time step told something of the clock.
-                prior = _moved(prior, clock - self._clock)
+            # The sightings of this time step told something of the clock.
+            prior = None if prior is None else _moved(prior, clock - self._clock)
             moment = _Moment(time, frame[which], home[which], beliefs.at(which), prior, cross, clock)
             self._moments.setdefault(key, []).append(moment)
         self._priors = {}
@@ -256,11 +255,7 @@ def _passed_back(moments: list[_Moment]) -> list[Summary]:
         unit = prior.noise.diagonal(dim1=-2, dim2=-1).rsqrt()
         white = unit[..., :, None] * prior.noise * unit[..., None, :]
         gain = (later.cross * unit[..., None, :]) @ torch.linalg.inv_ex(white)[0] * unit[..., None, :]
-        beliefs.append(
-            Summary(
-                mean + (gain @ (after.mean - prior.mean)[..., None])[..., 0],
-                noise + gain @ (after.noise - prior.noise) @ gain.mT,
-                effect + gain @ (after.effect - prior.effect),
-            )
-        )
+        mean = mean + (gain @ (after.mean - prior.mean)[..., None])[..., 0]
+        noise = noise + gain @ (after.noise - prior.noise) @ gain.mT
+        beliefs.append(Summary(mean, noise, effect + gain @ (after.effect - prior.effect)))
     return beliefs[::-1]

@@ -110,10 +110,8 @@ def group_objects(
     taken = {mark for one in found if not one.doubt for mark in one.marks}
     alone = [mark for mark in range(len(scene.camera)) if mark not in taken]
     count = len(rig)
-    rows = [
-        *(one.marks for one in found),
-        *(tuple(mark if c == scene.camera[mark] else -1 for c in range(count)) for mark in alone),
-    ]
+    rows = [one.marks for one in found]
+    rows += [tuple(mark if c == scene.camera[mark] else -1 for c in range(count)) for mark in alone]
     marks = [each.anchors(options.anchor) for each in seen if each is not None]
     every = torch.cat(marks) if marks else scene.pixels
     place = every.device
@@ -121,10 +119,9 @@ def group_objects(
     there = numbers >= 0
     pixels = torch.where(there[..., None], every[numbers.clamp_min(0)], torch.nan)
     score = scene.score.to(place)
-    stamps = [math.nan if each is None else float(each.time or 0.0) for each in seen]
-    known = [stamp for stamp in stamps if math.isfinite(stamp)]
-    filled = [stamp if math.isfinite(stamp) else min(known, default=0.0) for stamp in stamps]
-    time = torch.tensor(filled, dtype=torch.float64, device=place)
+    early = min((each.time or 0.0 for each in seen if each is not None), default=0.0)
+    stamps = [early if each is None else each.time or 0.0 for each in seen]
+    time = torch.tensor(stamps, dtype=torch.float64, device=place)
     firsts = [next(mark for mark in row if mark >= 0) for row in rows]
     return ObjectViews(
         pixels=pixels,

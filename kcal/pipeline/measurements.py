@@ -243,12 +243,7 @@ class Sightings(NamedTuple):
 
 @torch.no_grad()
 def sightings(
-    known: KnownViews,
-    pixels: Tensor,
-    seen: Tensor,
-    covariance: Tensor,
-    time: Tensor,
-    lasting_px: float = 0.0,
+    known: KnownViews, pixels: Tensor, seen: Tensor, covariance: Tensor, time: Tensor, lasting_px: float = 0.0
 ) -> Sightings:
     """Measure objects of one time step.
 

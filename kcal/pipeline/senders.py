@@ -172,11 +172,9 @@ class MqttSender:
 
 def _network_address(address: str, schemes: tuple[str, str]) -> tuple[bool, tuple[str, int]]:
     parts = urlsplit(address)
-    port: int | None
-    try:
+    port = None
+    with contextlib.suppress(ValueError):
         port = parts.port
-    except ValueError:
-        port = None
     if parts.scheme not in schemes or not parts.hostname or not port or parts.path:
         raise InputError(f"{_without_password(address)}: write {schemes[0]}://HOST:PORT or {schemes[1]}://HOST:PORT")
     return parts.scheme == schemes[1], (parts.hostname, port)
@@ -235,14 +233,12 @@ class LiveMap:
     """
 
     def __init__(self, run: Located, port: int, start: datetime.datetime | None = None) -> None:
+        word = " camera" if run.centers is None else ""
         cameras = [
-            {
-                "name": camera.name if run.centers is not None else f"{camera.name} camera",
-                "place": camera_place(camera, run.place),
-                "field": field_of_view(camera, run.place, _FIELD_REACH_M),
-            }
+            {"name": f"{camera.name}{word}", "place": camera_place(camera, run.place),
+             "field": field_of_view(camera, run.place, _FIELD_REACH_M)}
             for camera in run.cameras
-        ]
+        ]  # fmt: skip
         self.run, self.readers, self._start = run, 0, start
         coast = coast_near(run.place.lat, run.place.lon)
         self._site = orjson.dumps({"cameras": cameras, "coast": coast})
@@ -274,8 +270,7 @@ class LiveMap:
             places, _ = self._trails.get(columns.names[i], (deque(maxlen=_TRAIL), 0.0))
             places.append(_place_of(columns, i, self.run.place))
             self._trails[columns.names[i]] = places, time_s
-        kept = (one for one in self._trails.items() if 0.0 <= time_s - one[1][1] <= _TRAIL_KEPT_S)
-        self._trails = dict(kept)
+        self._trails = {name: one for name, one in self._trails.items() if 0.0 <= time_s - one[1] <= _TRAIL_KEPT_S}
 
     def close(self, words: str = "finished") -> None:
         """Tell each page how it ended, and end the server."""
@@ -361,14 +356,8 @@ def _tracks(columns: PositionColumns, run: Located) -> list[dict[str, Any]]:
         # The whole ring lies on the origin's side of the antimeridian.
         turn = place[1] - columns.numbers[i, 1]
         words = [_called(columns, i), length_text(distances[i], sigmas[i]), *_speed(columns, i)]
-        tracks.append(
-            {
-                "name": columns.names[i],
-                "place": place,
-                "region": np.round(ring + np.array([0.0, turn]), CORNER_DECIMALS).tolist(),
-                "text": ", ".join(words),
-            }
-        )
+        region = np.round(ring + np.array([0.0, turn]), CORNER_DECIMALS).tolist()
+        tracks.append({"name": columns.names[i], "place": place, "region": region, "text": ", ".join(words)})
     return tracks
 
 

@@ -262,12 +262,7 @@ _SHARED = ("information", "score", "values", "root")
 def settings_of(tracker: Tracker) -> str:
     """Hex digits that change with the rig, its errors and all options."""
     localize, shared = tracker.solved, tracker.shared
-    parts = [
-        _LAYOUT,
-        localize.rig.fingerprint,
-        repr(tracker.options),
-        repr(shared.scale.tolist()),
-    ]
+    parts = [_LAYOUT, localize.rig.fingerprint, repr(tracker.options), repr(shared.scale.tolist())]
     known = (localize.errors, localize.bending_errors)
     parts += ["none" if value is None else _packed(value)["data"] for value in known]
     parts += [] if tracker.moments is None else ["watched"]
@@ -517,8 +512,7 @@ class Stream:
                 sender.close()
             self.counts.unsent = sum(sender.failed for sender in self.senders)
             # The interpreter must not end while the reader computes; one that waits for input may be left alone.
-            close = getattr(source, "close", None)
-            if close is not None:
+            if (close := getattr(source, "close", None)) is not None:
                 close()
             items.close(0.5 if close is None else 10.0)
         return self.counts

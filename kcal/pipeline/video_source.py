@@ -555,14 +555,11 @@ class Videos:
         if not 0 <= match_sigma < math.inf:
             raise InputError(f"match_sigma: pixels, not negative, are needed, got {match_sigma}")
         self._compression = match_sigma**2 * torch.diag(torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64))
-        self._match: ObjectDisparity | None = None
-        if isinstance(rig, Rig):
-            self._sizes = {"left": rig.left.size, "right": rig.right.size}
-            self._match = ObjectDisparity(rig)
-        else:
-            self._sizes = {name: camera.size for name, camera in zip(rig.rig.names, rig.rig.each, strict=True)}
-        together = self._match is not None
-        self._frames = FramesTogether(videos, self._sizes, pairs=together, late=late, apart_s=apart_s, tell=tell)
+        self._match = ObjectDisparity(rig) if isinstance(rig, Rig) else None
+        names, cameras = (("left", "right"), rig.each) if isinstance(rig, Rig) else (rig.rig.names, rig.rig.each)
+        self._sizes = {name: camera.size for name, camera in zip(names, cameras, strict=True)}
+        both = self._match is not None
+        self._frames = FramesTogether(videos, self._sizes, pairs=both, late=late, apart_s=apart_s, tell=tell)
         self.counts, self.live = self._frames.counts, self._frames.live
         self._rig, self._detector, self._options = rig, detector, options
 

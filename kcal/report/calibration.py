@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, Normalize
@@ -358,13 +358,9 @@ def coverage_figure(observations: Observations, ax: Axes | None = None) -> Figur
     rows = _CELLS if height > width else max(1, round(_CELLS * height / width))
     u, v = pixels[seen].T
     views = np.broadcast_to(np.arange(len(pixels))[:, None], seen.shape)[seen]
-    cells = np.zeros((rows, columns))
-    for view in range(len(pixels)):
-        mine = views == view
-        once, _, _ = np.histogram2d(
-            v[mine], u[mine], bins=(rows, columns), range=((-0.5, height - 0.5), (-0.5, width - 0.5))
-        )
-        cells += once > 0
+    count = max(len(pixels), 1)
+    ends = [(-0.5, size - 0.5) for size in (count, height, width)]
+    cells = (np.histogramdd((views, v, u), (count, rows, columns), ends)[0] > 0).sum(0, dtype=float)
     share = percent_text(1.0 - unreached_share(observations))
     title = f"{len(pixels)} views, {int(seen.sum())} corners; boards reached {share} of the image, hatched: not"
     axes = figures.image_panel(ax, (width, height), title, ["Gray: how many views reached a part of the image."])
@@ -437,19 +433,13 @@ def _draw_failed(axes: Axes, failed: FailedImage, size: tuple[int, int]) -> None
         spine.set(visible=True, color=figures.WARN, linewidth=2.0)
 
 
-def _thumbnail(path: str | Path | None, size: tuple[int, int]) -> npt.NDArray[np.uint8]:
+def _thumbnail(path: str | Path | None, size: tuple[int, int]) -> NDArray[np.uint8]:
     """Subsample an image; gray where the file is missing or has another size."""
-    gray = np.full((2, 2), 200, np.uint8)
-    if path is None:
-        return gray
-    try:
-        image = to_8bit(read_gray(path))
-    except FileError:
-        return gray
-    if (image.shape[1], image.shape[0]) != size:
-        return gray
-    step = max(1, max(image.shape) // _THUMB)
-    return image[step // 2 :: step, step // 2 :: step]
+    with suppress(FileError):
+        if path is not None and (image := to_8bit(read_gray(path))).shape[::-1] == size:
+            step = max(1, max(image.shape) // _THUMB)
+            return image[step // 2 :: step, step // 2 :: step]
+    return np.full((2, 2), 200, np.uint8)
 
 
 # Draw how differently two lenses see: a map of the difference with magnified arrows, and of its error bars.
@@ -469,17 +459,14 @@ def difference_figure(
         lines: below; those that sum it up if left out.
         narrow: for a phone.
     """
-    if lines is None:
-        lines = (
-            difference_text(found)
-            if isinstance(found, CameraDifference)
-            else [f"{found.model}: RMS {found.rms:.4g} px, largest {found.largest:.4g} px, at infinity"]
-        )
-    sigma = found.sigma if isinstance(found, CameraDifference) else None
+    if isinstance(found, CameraDifference):
+        sigma, told = found.sigma, difference_text(found)
+    else:
+        sigma, told = None, [f"{found.model}: RMS {found.rms:.4g} px, largest {found.largest:.4g} px, at infinity"]
     low, high = (value.flatten(0, 1) for value in (found.pixels.amin((0, 1), True), found.pixels.amax((0, 1), True)))
     width, height = (round(float(value)) for value in (high - low)[0] + (1.0 if float(low[0, 0]) >= 0 else 0.0))
     sizes = [found.length.numpy()] + ([sigma.numpy()] if sigma is not None else [])
-    figure, panels = figures.image_figure((width, height), len(sizes), title, lines, narrow)
+    figure, panels = figures.image_figure((width, height), len(sizes), title, told if lines is None else lines, narrow)
     places = found.pixels.numpy()
     most = max(float(np.nanmax(values)) for values in sizes)
     least = min(float(np.nanquantile(values, 0.05)) for values in sizes)

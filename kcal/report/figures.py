@@ -124,9 +124,8 @@ def one_panel(ax: Axes | None, width: float, height: float, title: str = "", not
     """Make a framed figure with one panel; or take the caller's panel, which gets the title, and no notes."""
     if ax is None:
         return framed_figure(width, height, title, notes).add_subplot()
-    ax.set_title(
-        "\n".join(wrapped(title, 0.8 * ax.get_window_extent().width / ax.figure.dpi, 10.0)), fontsize=10, loc="left"
-    )
+    lines = wrapped(title, 0.8 * ax.get_window_extent().width / ax.figure.dpi, 10.0)
+    ax.set_title("\n".join(lines), fontsize=10, loc="left")
     return ax
 
 
@@ -188,10 +187,9 @@ def plain_number(value: float, _: object = None) -> str:
     return f"{value:g}"
 
 
-def frame_image(axes: Axes, size: tuple[int, int], margin: float = 0.0) -> None:
-    """Show an image's pixels (width, height), v down, with a margin of that share of its size."""
-    (width, height), (across, down) = size, (margin * size[0], margin * size[1])
-    axes.set(xlim=(-0.5 - across, width - 0.5 + across), ylim=(height - 0.5 + down, -0.5 - down))
+def frame_image(axes: Axes, size: tuple[int, int]) -> None:
+    """Show an image's pixels (width, height), v down."""
+    axes.set(xlim=(-0.5, size[0] - 0.5), ylim=(size[1] - 0.5, -0.5))
     axes.set(aspect="equal", xlabel="u, pixels", ylabel="v, pixels")
 
 

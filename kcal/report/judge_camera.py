@@ -9,20 +9,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+import kcal.calibrate.camera.trust as trust
 from kcal.calibrate.camera.advice import ROLL_SPAN, board_tilts, reached, roll_span, unreached_share, what_to_photograph
 from kcal.calibrate.camera.checks import mirrored_views
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, Progress
-from kcal.calibrate.camera.trust import (
-    PREDICTED,
-    Examination,
-    HalvesDifference,
-    PlainLens,
-    ResidualStructure,
-    examine,
-    seen_pixels,
-    summarize,
-    unexplained,
-)
 from kcal.calibrate.rig.pairs import names_by_side
 from kcal.corners.observations import Observations
 from kcal.finding import FAULTS, Finding, Severity, sorted_findings
@@ -60,19 +50,17 @@ def view_findings(result: CameraCalibrationResult, noise: float | None = None) -
         result: the calibration.
         noise: of a corner along an axis, px, under a lens that fits; that of the calibration if left out.
     """
-    used = result.cam_from_board_rotation.isfinite().all(-1).all(-1)
+    seen, used = result.observations, result.cam_from_board_rotation.isfinite().all(-1).all(-1)
     rotation = result.cam_from_board_rotation[used]
     middle = rotation @ result.board_points.mean(0) + result.cam_from_board_translation[used]
     found = [
-        _order_finding(seen_pixels(result)[used], result.observations),
+        _order_finding(trust.seen_pixels(result)[used], seen),
         *_pose_findings(result.camera, rotation, middle),
+        _coverage_finding(seen),
+        _sides_finding(seen.names, "doubt"),
+        _blur_finding(result.noise if noise is None else noise, _blurred_share(seen)),
+        _few_finding(len(rotation)),
     ]
-    found += [
-        _coverage_finding(result.observations),
-        _sides_finding(result.observations.names, "doubt"),
-        _blur_finding(result.noise if noise is None else noise, _blurred_share(result.observations)),
-    ]
-    found.append(_few_finding(len(rotation)))
     return [finding for finding in found if finding is not None]
 
 
@@ -171,12 +159,8 @@ def _coverage_finding(observations: Observations) -> Finding:
     text = f"no board reached {percent_text(share)} of the image, and {percent_text(border)} of its border"
     if share <= _UNREACHED and border <= _BORDER:
         return Finding("coverage", "fine", text)
-    return Finding(
-        "coverage",
-        "doubt",
-        f"{text}: there the camera rests on its lens model alone",
-        "show the board at the borders and in the corners of the image, parts of it outside if need be",
-    )
+    action = "show the board at the borders and in the corners of the image, parts of it outside if need be"
+    return Finding("coverage", "doubt", f"{text}: there the camera rests on its lens model alone", action)
 
 
 def _blurred_share(observations: Observations) -> float:
@@ -222,7 +206,7 @@ _LENS = 5.0
 
 
 def model_findings(
-    result: CameraCalibrationResult, options: CalibrationOptions, found: Examination
+    result: CameraCalibrationResult, options: CalibrationOptions, found: trust.Examination
 ) -> tuple[list[Finding], float]:
     """Findings about lens model, board and error bars, and the px RMS by which the camera errs beyond its error bars.
 
@@ -232,14 +216,14 @@ def model_findings(
     structure = found.structure
     patterns = structure.neighbors > _NEIGHBORS or structure.image > _IMAGE
     apart = _far_halves(found.halves, patterns)
-    beyond = max((unexplained(half.difference, _LIKELY) for half in apart), default=0.0)
+    beyond = max((trust.unexplained(half.difference, _LIKELY) for half in apart), default=0.0)
     # Names may tell two cameras apart of which every other view is the one: they are the better reason then.
     worst = next((half for half in apart if not half.alike and half.own < _OWN * result.rms), next(iter(apart), None))
     against = None if worst is None else _apart_finding(result, found.halves, worst, patterns, structure)
     if found.model is not None and found.reference is not None:
         named = _against_reference(result, options, found, found.model.rms)
         certain = named is not None and named.name in ("board", "pupil")
-        wrong = found.model.rms if certain or patterns else unexplained(found.model)
+        wrong = found.model.rms if certain or patterns else trust.unexplained(found.model)
         beyond = max(beyond, wrong)
         if named is None and wrong:
             text = (
@@ -270,7 +254,7 @@ def model_findings(
     return findings, beyond
 
 
-def _halves_agree(halves: Sequence[HalvesDifference]) -> bool:
+def _halves_agree(halves: Sequence[trust.HalvesDifference]) -> bool:
     return all((half.difference.probability or 0.0) >= _AGREE for half in halves)
 
 
@@ -278,12 +262,12 @@ def fault_of_views(
     result: CameraCalibrationResult, options: CalibrationOptions, progress: Progress = lambda _: None
 ) -> Finding | None:
     """What a calibration's own views say against its error bars, if it moves the camera beyond these; else None."""
-    findings, beyond = model_findings(result, options, examine(result, options, progress))
-    faults = [finding for finding in findings if finding.part == FAULTS]
-    return faults[0] if faults and (beyond > 0.0 or faults[0].severity == "stop") else None
+    findings, beyond = model_findings(result, options, trust.examine(result, options, progress))
+    fault = next((finding for finding in findings if finding.part == FAULTS), None)
+    return fault if fault is not None and (beyond > 0.0 or fault.severity == "stop") else None
 
 
-def _patterns_finding(found: Examination) -> Finding:
+def _patterns_finding(found: trust.Examination) -> Finding:
     """Residuals that are not noise, where no harm of it was measured."""
     structure = found.structure
     what = (
@@ -297,22 +281,19 @@ def _patterns_finding(found: Examination) -> Finding:
         if agree
         else "halves of the views do not show that the error bars allow for it"
     )
-    return Finding(
-        "patterns",
-        "note" if agree else "doubt",
-        f"residuals are not only noise: {what}; {checked}",
-        "for smaller error bars use a flat, stiff board on a stand, with fixed focus and zoom",
-    )
+    action = "for smaller error bars use a flat, stiff board on a stand, with fixed focus and zoom"
+    text = f"residuals are not only noise: {what}; {checked}"
+    return Finding("patterns", "note" if agree else "doubt", text, action)
 
 
-def _prediction_finding(half: HalvesDifference, plain: PlainLens | None) -> Finding:
+def _prediction_finding(half: trust.HalvesDifference, plain: trust.PlainLens | None) -> Finding:
     """How well one half of the views predicts the other, beside fits and a plain lens."""
     ratio = half.held_out / half.own
     text = (
         f"the camera from one half of the views predicts the corners of the other half to {half.held_out:.2g} px RMS, "
         f"{ratio:.2f} times what is left where they are fitted"
     )
-    if ratio <= PREDICTED:
+    if ratio <= trust.PREDICTED:
         return Finding("prediction", "fine", text)
     better = plain is not None and plain.own > _PLAIN * plain.held_out
     if plain is not None:
@@ -327,7 +308,7 @@ def _prediction_finding(half: HalvesDifference, plain: PlainLens | None) -> Find
     return Finding("prediction", "stop", text, action, part=FAULTS)
 
 
-def _far_halves(halves: Sequence[HalvesDifference], patterns: bool) -> list[HalvesDifference]:
+def _far_halves(halves: Sequence[trust.HalvesDifference], patterns: bool) -> list[trust.HalvesDifference]:
     """Halves that differ by more than their error bars state, the farthest first.
 
     Less is proof enough where something else says so too: `patterns` in the residuals, or that halves which are not
@@ -335,19 +316,19 @@ def _far_halves(halves: Sequence[HalvesDifference], patterns: bool) -> list[Halv
     """
     alike = min((half.held_out for half in halves if half.alike), default=math.inf)
 
-    def far(half: HalvesDifference) -> float:
+    def far(half: trust.HalvesDifference) -> float:
         also = patterns or (not half.alike and half.held_out > _APART * alike)
-        return unexplained(half.difference, _LIKELY if also else _CHANCE)
+        return trust.unexplained(half.difference, _LIKELY if also else _CHANCE)
 
     return sorted((half for half in halves if far(half)), key=far, reverse=True)
 
 
 def _apart_finding(
     result: CameraCalibrationResult,
-    halves: Sequence[HalvesDifference],
-    half: HalvesDifference,
+    halves: Sequence[trust.HalvesDifference],
+    half: trust.HalvesDifference,
     patterns: bool,
-    structure: ResidualStructure,
+    structure: trust.ResidualStructure,
 ) -> Finding:
     """Error bars that halves contradict, and what the tests say of the cause.
 
@@ -366,7 +347,7 @@ def _apart_finding(
             "two cameras in one file, or focus, zoom or image stabilization changed in between"
         )
         return Finding("changed", "stop", text, "calibrate from the images of one camera with fixed focus and zoom")
-    if alike is not None and not half.alike and not unexplained(alike.difference, _CHANCE):
+    if alike is not None and not half.alike and not trust.unexplained(alike.difference, _CHANCE):
         cause = (
             f". With {alike.label} it is {alike.difference.ratio:.1f} times, and the halves fit hardly better alone "
             f"(RMS {half.own:.2g} px, together {result.rms:.2g} px): it is one camera, and the board's shape, or how "
@@ -376,17 +357,12 @@ def _apart_finding(
         cause = f", and residuals are not noise (correlation {structure.neighbors:.2f}): lens model or board do not fit"
     else:
         cause = ": lens model or board do not fit"
-    return Finding(
-        "halves",
-        "doubt",
-        f"{how}{cause}. The error bars are too small",
-        "take the views again with one flat, stiff board on a stand, tilted and rolled in mixed order",
-        part=FAULTS,
-    )
+    action = "take the views again with one flat, stiff board on a stand, tilted and rolled in mixed order"
+    return Finding("halves", "doubt", f"{how}{cause}. The error bars are too small", action, FAULTS)
 
 
 def _against_reference(
-    result: CameraCalibrationResult, options: CalibrationOptions, found: Examination, far: float
+    result: CameraCalibrationResult, options: CalibrationOptions, found: trust.Examination, far: float
 ) -> Finding | None:
     """What the reference finds that was left out: the board's shape, the pupil's movement, or another lens."""
     plain = found.structure.image < _LENS
@@ -398,13 +374,8 @@ def _against_reference(
         text = f"{pupil}, which {result.camera.model} does not have: points at infinity are off by {far:.2g} px"
         action = "calibrate with the default lens (--model hybrid), or show the board from farther away"
         return Finding("pupil", "doubt", text, action, FAULTS)
-    if (
-        plain
-        and result.hybrid is None
-        and found.model is not None
-        and not unexplained(found.model)
-        and far > _image_rms(result.camera)
-    ):
+    alike = plain and result.hybrid is None and found.model is not None and not trust.unexplained(found.model)
+    if alike and far > _image_rms(result.camera):
         text = (
             f"another lens model fits these views as well as {result.camera.model} and differs by {far:.2g} px, "
             "most where no board was"
@@ -418,11 +389,10 @@ def _board_fault(
     result: CameraCalibrationResult, options: CalibrationOptions, reference: CameraCalibrationResult | None
 ) -> str:
     """How the board differs from the flat one that was assumed; empty where it does not, or was measured."""
-    if reference is None or reference.measured_board is None or not bool(reference.measured_board.amplitudes.any()):
+    board = None if reference is None else reference.measured_board
+    measured = options.hybrid and options.board != "exact"
+    if reference is None or board is None or measured or not bool(board.amplitudes.any()):
         return ""
-    if options.hybrid and options.board != "exact":
-        return ""
-    board = reference.measured_board
     better = reference.noise < 0.97 * result.noise
     if board.bending.value > _SURE * board.bending.sigma and better and not options.board_warp:
         return f"the board bends by {1e3 * board.bending.value:.2g} mm"
@@ -435,7 +405,7 @@ def _pupil_fault(result: CameraCalibrationResult, reference: CameraCalibrationRe
     """How the entrance pupil moves, where the model has none; empty where it does not."""
     if reference is None or result.hybrid is not None:
         return ""
-    brief = summarize(reference)
+    brief = trust.summarize(reference)
     if brief.pupil is None or not brief.pupil_sigma or abs(brief.pupil) < _SURE * brief.pupil_sigma:
         return ""
     return f"the entrance pupil moves by {1e3 * abs(brief.pupil):.2g} mm towards the image's corners"
@@ -457,7 +427,7 @@ def camera_verdict(
     baseline: float = 10.0,
     mark_sigma: float = 0.3,
     subject: str = "camera",
-    examination: Examination | None = None,
+    examination: trust.Examination | None = None,
     stored: Camera | None = None,
     progress: Progress = lambda _: None,
 ) -> Verdict:
@@ -493,7 +463,7 @@ def camera_verdict(
         (True, ['depth', 'coverage', 'views', 'patterns', 'halves', 'motion', 'roll'])
     """
     options = options or CalibrationOptions()
-    examination = examination or examine(result, options, progress)
+    examination = examination or trust.examine(result, options, progress)
     against, beyond = model_findings(result, options, examination)
     # Faults of the views come first: without tilts or with blur the model looks wrong too.
     reference = examination.reference or result
@@ -581,14 +551,10 @@ def other_views(stored: Camera, result: CameraCalibrationResult) -> tuple[list[F
     text += f": they give one that differs by {found.rms:.2g} px (RMS)"
     if found.ratio is not None:
         text += f", {found.ratio:.1f} times what the error bars predict"
-    other = Finding(
-        "other-views",
-        "doubt" if found.same else "stop",
-        text,
-        "give the observations that it was calibrated from, or calibrate it again",
-    )
+    action = "give the observations that it was calibrated from, or calibrate it again"
     told = record_findings(record) if record is not None and missing else []
-    return [other, *told], unexplained(found)
+    other = Finding("other-views", "doubt" if found.same else "stop", text, action)
+    return [other, *told], trust.unexplained(found)
 
 
 def _image_rms(camera: Camera) -> float:
@@ -606,8 +572,8 @@ def _camera_answers(
 ) -> tuple[RangeAnswer, ...]:
     """Ranges of targets by two such cameras: Z² / (f B) for each pixel of disparity, which both cameras spoil."""
     answers = []
+    pixels = {"marks": mark_sigma, "lenses": sigma, FAULTS: beyond}
     for need in needs:
         slope = math.sqrt(2.0) * need.distance**2 / (paraxial_focal(camera).mean[0] * baseline)
-        parts = {"marks": slope * mark_sigma, "lenses": slope * sigma, FAULTS: slope * beyond}
-        answers.append(RangeAnswer(requirement=need, parts=parts))
+        answers.append(RangeAnswer(requirement=need, parts={name: slope * one for name, one in pixels.items()}))
     return tuple(answers)

@@ -83,13 +83,7 @@ def synchrony(rig: Rig, board_points: Tensor, pixels: Tensor) -> Synchrony:
     (turn_right, shift_right), right_spread, right_cost = _alone(rig.right, board_points, pixels[:, 1])
     relative = rig.right_from_left_rotation
     predicted = relative @ turn, shift @ relative.T + rig.right_from_left_translation
-    apart = torch.cat(
-        [
-            vector_from_rotation(turn_right @ predicted[0].transpose(-1, -2)),
-            shift_right - predicted[1],
-        ],
-        -1,
-    )
+    apart = torch.cat([vector_from_rotation(turn_right @ predicted[0].mT), shift_right - predicted[1]], -1)
     both = torch.block_diag(relative, relative)
     corners = pixels.isfinite().all(-1).sum(-1)
     noise = (left_cost + right_cost).sum() * 2.0 / (2 * corners - 6).sum()
@@ -185,7 +179,10 @@ def rig_verdict(
         if compared is not None and compared.pairs:
             findings.append(_synchrony_finding(compared))
         elif unpaired or (result is None and rig.calibration is not None and rig.calibration.pairs):
-            findings.append(_unpaired_finding(unpaired or "no pairs of views were given"))
+            why = unpaired or "no pairs of views were given"
+            text = f"whether both cameras saw the board at the same moments could not be checked: {why}"
+            action = "give the observations of the pairs (--observations LEFT RIGHT)"
+            findings.append(Finding("synchronization", "doubt", text, action))
     beyond = [verdict.unexplained for verdict in cameras]
     worst = [_worst_sigmas(rig, requirement.distance, mark_sigma) for requirement in requirements]
     both = list(zip(requirements, worst, strict=True))
@@ -234,11 +231,8 @@ def _rig_answer(
     """
     if worst is None:
         return RangeAnswer(requirement=requirement, parts={"marks": math.inf, "lenses": 0.0, "relative pose": 0.0})
-    parts = {
-        "marks": float(worst.marks),
-        "lenses": float(worst.lenses) if known else math.inf,
-        "relative pose": float(worst.pose) if known else math.inf,
-    }
+    lenses, pose = (float(worst.lenses), float(worst.pose)) if known else (math.inf, math.inf)
+    parts = {"marks": float(worst.marks), "lenses": lenses, "relative pose": pose}
     if any(beyond):
         # Each camera's errors spoil a range as the noise of its marks does.
         parts[FAULTS] = float(worst.marks) / mark_sigma * math.hypot(*beyond) / math.sqrt(len(beyond))
@@ -273,18 +267,6 @@ def _worst_of_pair(rig: Rig, distance: float, mark_sigma: float) -> RangeSigmas:
 
 def _own_findings(rig: Rig, result: RigResult | None) -> list[Finding]:
     """What the rig's own solution says, and what could not be checked."""
-    found = _doubts(rig, result)
-    record = rig.calibration
-    if record is None and result is None:
-        text = "the rig's file does not tell how it was solved: residuals and what was left out could not be checked"
-        found.append(Finding("record", "doubt", text))
-    for one in result.findings if result is not None else record.findings if record is not None else ():
-        # It is more than a warning that was printed.
-        found.append(dataclasses.replace(one, action=_MEASURE_AGAIN) if one.severity == "stop" else one)
-    return found
-
-
-def _doubts(rig: Rig, result: RigResult | None) -> list[Finding]:
     found = []
     if not rig.known:
         text = "the rig has no error bars: nobody can say how wrong its ranges are"
@@ -313,6 +295,12 @@ def _doubts(rig: Rig, result: RigResult | None) -> list[Finding]:
             "survey and marks do not fit each other"
         )
         found.append(Finding("misfit", "stop", text, "look at the residuals by item, and correct what stands out"))
+    if solved is None:
+        text = "the rig's file does not tell how it was solved: residuals and what was left out could not be checked"
+        found.append(Finding("record", "doubt", text))
+    for one in solved.findings if solved is not None else ():
+        # It is more than a warning that was printed.
+        found.append(dataclasses.replace(one, action=_MEASURE_AGAIN) if one.severity == "stop" else one)
     return found
 
 
@@ -322,8 +310,8 @@ def _exact_lenses(rig: Rig, result: RigResult | None) -> tuple[str, ...]:
         return result.exact
     if rig.root is None or not rig.known:
         return ()
-    parts = zip(rig.names, rig.root[:, : sum(rig.sizes)].split(rig.sizes, 1), strict=True)
-    return tuple(name for name, part in parts if not bool(part.any()))
+    parts = rig.root[:, : sum(rig.sizes)].split(rig.sizes, 1)
+    return tuple(name for name, part in zip(rig.names, parts, strict=True) if not bool(part.any()))
 
 
 def _pairs_compared(rig: Rig, result: RigResult | None, pairs: tuple[Tensor, Tensor] | None) -> Synchrony | None:
@@ -346,31 +334,18 @@ def _unseen_finding(distance: float) -> Finding:
     return Finding("view", "stop", text, action)
 
 
-def _unpaired_finding(why: str) -> Finding:
-    text = f"whether both cameras saw the board at the same moments could not be checked: {why}"
-    action = "give the observations of the pairs (--observations LEFT RIGHT)"
-    return Finding("synchronization", "doubt", text, action)
-
-
 def _synchrony_finding(found: Synchrony) -> Finding:
-    late = (
-        found.delay is not None
-        and found.delay_sigma is not None
-        and abs(found.delay) > max(_LATE_SIGMAS * found.delay_sigma, _LATE)
-    )
-    if found.ratio <= _APART and not late:
+    delay, how = found.delay or 0.0, ""
+    sigma = math.inf if found.delay_sigma is None else found.delay_sigma
+    if abs(delay) > max(_LATE_SIGMAS * sigma, _LATE):
+        which = "after" if delay > 0 else "before"
+        how = f"; the right camera took its pictures {abs(delay):.2f} ± {sigma:.2f} steps {which} the left one"
+    elif found.ratio <= _APART:
         text = (
             f"both cameras saw the board in the same place in {found.pairs} pairs "
             f"({found.ratio:.1f} times what noise explains)"
         )
         return Finding("synchronization", "fine", text)
-    how = ""
-    if late and found.delay is not None and found.delay_sigma is not None:
-        which = "after" if found.delay > 0 else "before"
-        how = (
-            f"; the right camera took its pictures {abs(found.delay):.2f} ± {found.delay_sigma:.2f} steps {which} "
-            "the left one"
-        )
     text = (
         f"the board moved between both exposures, or a camera did: it is {1e3 * found.shift:.2g} mm elsewhere for "
         f"the right camera, {found.ratio:.1f} times what noise explains{how}"

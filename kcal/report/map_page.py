@@ -22,20 +22,10 @@ from PIL.TiffImagePlugin import TiffImageFile
 from pyproj.exceptions import ProjError
 from torch import Tensor
 
+import kcal.locate.positions as places
 from kcal.errors import FileError, InputError
 from kcal.file_kind import check_pixel_count
 from kcal.files import read_bytes, write_atomic
-from kcal.locate.positions import (
-    Located,
-    Position,
-    camera_place,
-    field_azimuths,
-    field_of_view,
-    level_rim,
-    map_places,
-    near,
-    region_rings,
-)
 from kcal.locate.stereo import PositionStatus
 from kcal.report.pages import from_template
 from kcal.report.tables import interval_text, range_sigma, range_unit
@@ -125,10 +115,8 @@ def local_image(path: str | Path) -> dict[str, Any]:
         to_map = pyproj.Transformer.from_crs(system, "EPSG:3857", always_xy=True)
         height, width = pixels.shape[:2]
         along = np.linspace(0, 1, 33)
-        border = np.concatenate(
-            [np.stack([along * width, edge * height + 0 * along], -1) for edge in (0, 1)]
-            + [np.stack([edge * width + 0 * along, along * height], -1) for edge in (0, 1)]
-        )
+        sides = [(along, 0 * along + edge) for edge in (0, 1)]
+        border = np.concatenate([np.stack(side, -1) for u, v in sides for side in ((u, v), (v, u))]) * (width, height)
         world = border @ matrix[:, :2].T + matrix[:, 2]
         x, y = to_map.transform(world[:, 0], world[:, 1])
         if not np.isfinite([*x, *y]).all():
@@ -209,7 +197,7 @@ LatLon = tuple[float, float]
 
 
 def map_page(
-    located: Located,
+    located: places.Located,
     truth: Tensor | None = None,
     *,
     tiles: str | Path | None = None,
@@ -255,7 +243,7 @@ def map_page(
     )  # fmt: skip
 
 
-def save_map(path: str | Path, located: Located, truth: Tensor | None = None, **options: Any) -> Path:
+def save_map(path: str | Path, located: places.Located, truth: Tensor | None = None, **options: Any) -> Path:
     """Write positions on a map to an .html file that needs no network; for the options see `map_page`.
 
     Raises:
@@ -272,49 +260,47 @@ def check_map_format(path: str | Path) -> None:
         raise InputError(f"{path}: the map is a web page; the file name must end with .html")
 
 
-def _content(located: Located, truth: Tensor | None) -> dict[str, Any]:
+def _content(located: places.Located, truth: Tensor | None) -> dict[str, Any]:
     ranges = [p.range_m or p.range_low_m or 0.0 for p in located.positions]
     farthest = max((one for one in ranges if math.isfinite(one)), default=0.0) or 300.0
     reach = 1.15 * farthest
     cameras, edges = [], []
     for view in located.cameras:
-        sweep = field_azimuths(view)
+        sweep = places.field_azimuths(view)
         if sweep is not None:
             edges += [(float(a) - located.heading_deg + 180) % 360 - 180 for a in sweep[[0, -1]]]
-        outline, place = field_of_view(view, located.place, reach), camera_place(view, located.place)
+        outline, place = places.field_of_view(view, located.place, reach), places.camera_place(view, located.place)
         cameras.append({"name": view.name, "place": place, "field": outline})
     low, high = (min(edges), max(edges)) if edges else (-180.0, 180.0)
     sweep = torch.linspace(low, high, 90, dtype=torch.float64) + located.heading_deg
     arcs = [
-        {"name": range_text(arc), "line": map_places(level_rim((0, 0, 0), sweep, arc), located.place)}
+        {"name": range_text(arc), "line": places.map_places(places.level_rim((0, 0, 0), sweep, arc), located.place)}
         for arc in (arcs_within(reach) if located.centers is None else [])
     ]
-    bearings = [
-        map_places(
-            foot + level_rim((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0) * ends,
-            located.place,
-        )
-        for p, foot in zip(located.positions, located.feet, strict=True)
-        if p.azimuth_deg is not None and p.status != PositionStatus.OK
-        for ends in [torch.tensor([[min(p.range_low_m or 0.0, reach)], [reach]], dtype=torch.float64)]
-    ]
+    bearings = []
+    for p, foot in zip(located.positions, located.feet, strict=True):
+        if p.azimuth_deg is not None and p.status != PositionStatus.OK:
+            ends = torch.tensor([[min(p.range_low_m or 0.0, reach)], [reach]], dtype=torch.float64)
+            sight = places.level_rim((0.0, 0.0, 0.0), torch.full((2,), p.azimuth_deg, dtype=torch.float64), 1.0)
+            bearings.append(places.map_places(foot + sight * ends, located.place))
     arrows, true = [], []
     for position, row in zip(located.positions, [] if truth is None else truth, strict=truth is not None):
         if not bool(torch.isfinite(row).all()):
             continue
-        (spot,) = map_places(row[None], located.place)
+        (spot,) = places.map_places(row[None], located.place)
         true.append(spot)
         if position.enu is not None and position.lat is not None and position.lon is not None:
             miss = torch.tensor(position.enu, dtype=torch.float64) - row.detach().cpu().double()
             azimuth = math.degrees(math.atan2(float(miss[0]), float(miss[1])))
-            arrows.append({"line": [spot, (position.lat, near(position.lon, located.place.lon))], "azimuth": azimuth})
+            end = position.lat, places.near(position.lon, located.place.lon)
+            arrows.append({"line": [spot, end], "azimuth": azimuth})
     unit = range_unit(located)
     points = [
-        {"name": p.name, "place": (p.lat, near(p.lon, located.place.lon)), "rows": _popup_rows(p, unit)}
+        {"name": p.name, "place": (p.lat, places.near(p.lon, located.place.lon)), "rows": _popup_rows(p, unit)}
         for p in located.positions
         if p.lat is not None and p.lon is not None
     ]
-    rings = [[(lat, near(lon, located.place.lon)) for lat, lon in ring] for ring in region_rings(located)]
+    rings = [[(lat, places.near(lon, located.place.lon)) for lat, lon in ring] for ring in places.region_rings(located)]
     return {
         "cameras": cameras, "arcs": arcs, "regions": rings, "bearings": bearings, "arrows": arrows, "truth": true,
         "points": points, "coast": coast_near(located.place.lat, located.place.lon),
@@ -332,7 +318,7 @@ def arcs_within(reach: float) -> list[float]:
     return known or [arc for arc in _ROUND if reach / 12.0 < arc < reach]
 
 
-def _popup_rows(position: Position, unit: Unit) -> list[tuple[str, str]]:
+def _popup_rows(position: places.Position, unit: Unit) -> list[tuple[str, str]]:
     sigma = range_sigma(position)
     up = None if position.covariance is None else math.sqrt(position.covariance[2][2])
     height = position.height or 0.0

@@ -91,12 +91,8 @@ def from_template(name: str, style: str, scripts: Sequence[str] = (), images: st
         "distance": range_text, "found": _found, "percent": _percent, "sentence": _sentence, "embedded": _embedded,
         "data": page_data,
     }  # fmt: skip
-    values |= {
-        "style": style,
-        "scripts": scripts,
-        "policy": page_policy(scripts=scripts, styles=[style], images=images),
-    }
-    return environment.get_template(f"{name}.html").render(values)
+    policy = page_policy(scripts=scripts, styles=[style], images=images)
+    return environment.get_template(f"{name}.html").render(values, style=style, scripts=scripts, policy=policy)
 
 
 def save_verdict_page(

@@ -36,16 +36,8 @@ Array = NDArray[np.float64]
 
 _UNSURE = "#8a5a00"
 # The arcs of the paper's figure first, then rounder fillers where there is room.
-_ARCS = [
-    250,
-    1000,
-    5000,
-    100,
-    500,
-    2500,
-    *(k * 10.0**e for e in (-3, -2, -1, 0, 1, 4, 5) for k in (1, 2.5, 5)),
-    10.0**6,
-]
+_FILLERS = [k * 10.0**e for e in (-3, -2, -1, 0, 1, 4, 5) for k in (1, 2.5, 5)]
+_ARCS = [250, 1000, 5000, 100, 500, 2500, *_FILLERS, 10.0**6]
 # Of the median: longer intervals are cut off, so that the others can be seen.
 _LONGEST = 12.0
 _NAMED = 40
@@ -204,17 +196,16 @@ def _draw_truth(axes: Axes, position: Position, true: Array, scale: figures.Rang
 
 def _draw_names(axes: Axes, located: Located, shown: list[int], scale: figures.RangeScale, labels: list[Array]) -> None:
     """Write each name beside its point, away from other points and from the labels of the arcs."""
-    anchors = []
-    for i in shown:
-        position = located.positions[i]
-        if position.enu is not None:
-            anchors.append(scale.place(np.asarray(position.enu)))
-        else:
-            anchors.append(_polar(scale, position.azimuth_deg or 0.0, position.range_low_m or 0.0))
-    for i, anchor in zip(shown, anchors, strict=True):
+    positions = [located.positions[i] for i in shown]
+    anchors = [
+        _polar(scale, one.azimuth_deg or 0.0, one.range_low_m or 0.0)
+        if one.enu is None else scale.place(np.asarray(one.enu))
+        for one in positions
+    ]  # fmt: skip
+    for position, anchor in zip(positions, anchors, strict=True):
         others = [other - anchor for other in [*anchors, *labels] if other is not anchor]
         crowded = any(0 < other[0] < 0.2 and abs(other[1]) < 0.04 for other in others)
-        figures.name_point(axes, anchor, located.positions[i].name, (-8 if crowded else 8, 0), zorder=9)
+        figures.name_point(axes, anchor, position.name, (-8 if crowded else 8, 0), zorder=9)
 
 
 def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: list[int]) -> None:
@@ -236,29 +227,20 @@ def _draw_ranges(axes: Axes, located: Located, true_enu: Array | None, shown: li
             axes.plot(0.0, row, "o", color=figures.INK, markerfacecolor="white", markersize=6, zorder=3)
         if true is not None:
             marker = "x" if abs(true) <= limit else ">" if true > 0 else "<"
-            style: dict[str, Any] = {
-                "color": figures.WARN,
-                "markersize": 7,
-                "markeredgewidth": 1.6,
-                "zorder": 4,
-                "clip_on": False,
-            }
-            axes.plot(max(-limit, min(limit, true)), row, marker, **style)
+            style: dict[str, Any] = {"markersize": 7, "markeredgewidth": 1.6, "zorder": 4, "clip_on": False}
+            axes.plot(max(-limit, min(limit, true)), row, marker, color=figures.WARN, **style)
     axes.xaxis.set_major_locator(MaxNLocator(6, symmetric=True))
     axes.xaxis.set_major_formatter(lambda value, _: f"{100 * value:+.3g} %" if value else "0")
     axes.set(xlim=(-limit, limit), ylim=(len(order) - 0.3, -0.7), yticks=[])
     if len(order) <= _NAMED:
         unit, size = range_unit(located), 9 if len(order) <= 20 else 7
-        names = [
-            f"{figures.shortened(located.positions[i].name, 40)}  {_estimate(located.positions[i], unit)}"
-            for i in order
-        ]
+        style = {"transform": axes.get_yaxis_transform(), "va": "center", "color": figures.GRAY}
+        names = []
+        for row, (i, (low, high, _)) in enumerate(zip(order, spans, strict=True)):
+            position = located.positions[i]
+            names.append(f"{figures.shortened(position.name, 40)}  {_estimate(position, unit)}")
+            axes.text(1.03, row, _interval_text(position, low, high, unit), fontsize=size, **style)
         axes.set_yticks(range(len(order)), names, fontsize=size)
-        for row, (i, span) in enumerate(zip(order, spans, strict=True)):
-            text = _interval_text(located.positions[i], *span[:2], unit)
-            axes.text(
-                1.03, row, text, transform=axes.get_yaxis_transform(), va="center", fontsize=size, color=figures.GRAY
-            )
     axes.grid(axis="x", color="#e5e7eb", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right", "left"]].set_visible(False)
@@ -284,9 +266,9 @@ def _relative(position: Position, true: Array | None) -> tuple[float, float, flo
 
 
 def _estimate(position: Position, unit: Unit) -> str:
-    return (
-        "bearing only" if position.range_m is None else length_text(position.range_m, range_sigma(position), unit=unit)
-    )
+    if position.range_m is None:
+        return "bearing only"
+    return length_text(position.range_m, range_sigma(position), unit=unit)
 
 
 def _interval_notes(located: Located) -> list[str]:
@@ -313,8 +295,7 @@ def stations_figure(located: Located, truth: Tensor | None = None, ax: Axes | No
     notes = ["Outlines: 95 % regions. Dashed: bearings without a range."]
     axes = figures.one_panel(ax, 8.0, 7.0, located.count_note, notes)
     towers = torch.tensor([camera.enu[:2] for camera in located.cameras], dtype=torch.float64)
-    found = located.enu[located.enu.isfinite().all(-1)]
-    shown = torch.cat([towers, found[:, :2]])
+    shown = torch.cat([towers, located.enu[located.enu.isfinite().all(-1), :2]])
     reach = _REACH * max(float((shown.amax(0) - shown.amin(0)).amax()), 1.0) / 1e3
     for number, (camera, place) in enumerate(zip(located.cameras, (towers / 1e3).numpy(), strict=True)):
         color, sweep = figures.CAMERA_COLORS[number % len(figures.CAMERA_COLORS)], field_azimuths(camera)
@@ -376,15 +357,12 @@ def budget_figure(
         labels: source -> text in the legend.
         ax: of yours, to draw into.
     """
-    axes = figures.one_panel(
-        ax, 8.6, 5.7, "Range error by source", ["Solid: outward. Dotted: inward. Dashed: to first order."]
-    )
-    far = distances.numpy()
+    notes = ["Solid: outward. Dotted: inward. Dashed: to first order."]
+    axes, far = figures.one_panel(ax, 8.6, 5.7, "Range error by source", notes), distances.numpy()
     for name, error in found.items():
         color = _SOURCE_COLORS.get(name, "#111827")
-        outward = error.farther.clone()
         # Infinite errors are not drawn: the line leaves the picture there.
-        outward[~outward.isfinite()] = float("nan")
+        outward = torch.where(error.farther.isfinite(), error.farther, torch.nan)
         axes.plot(far, outward.numpy(), color=color, linewidth=2.0, label=labels.get(name, name))
         axes.plot(far, error.nearer.abs().numpy(), color=color, linewidth=1.4, linestyle=":")
         axes.plot(far, error.first_order.numpy(), color=color, linewidth=0.8, linestyle=(0, (6, 4)), alpha=0.8)

@@ -26,14 +26,9 @@ from kcal.threads import in_one_thread
 Array = NDArray[np.float64]
 
 _COLORS = {
-    "boards": "#4b5563",
-    "landmarks": "#2b6cb0",
-    "features": "#0f766e",
-    "stars": "#b7791f",
-    "skyline": "#be3455",
-    "baselines": "#7c3aed",
-    "positions": "#dd7a1f",
-}
+    "boards": "#4b5563", "landmarks": "#2b6cb0", "features": "#0f766e", "stars": "#b7791f", "skyline": "#be3455",
+    "baselines": "#7c3aed", "positions": "#dd7a1f",
+}  # fmt: skip
 _ROWS = 45
 # Of what is shown: cameras farther from their middle stand around it.
 _WIDE = 0.1
@@ -120,9 +115,8 @@ def _draw_plan(axes: Axes, result: RigResult, columns: int) -> None:
         if nearest / 4 <= radius <= reach:
             ring = float(scale.radius(radius))
             axes.plot(ring * np.sin(circle), ring * np.cos(circle), color=figures.FAINT, linewidth=0.7, linestyle=":")
-            figures.name_point(
-                axes, (0.0, ring), range_text(radius), (0, 1), color=figures.GRAY, ha="center", va="bottom", fontsize=8
-            )
+            style: dict[str, Any] = {"color": figures.GRAY, "ha": "center", "va": "bottom", "fontsize": 8}
+            figures.name_point(axes, (0.0, ring), range_text(radius), (0, 1), **style)
     for kind, (points, names, used) in places.items():
         drawn, good = scale.place(points), np.array(used)
         marker = {"landmarks": "^", "boards": "s", "features": "o"}[kind]
@@ -155,8 +149,7 @@ def _draw_plan(axes: Axes, result: RigResult, columns: int) -> None:
 
 def _edges(result: RigResult, c: int, camera: Camera) -> tuple[float, float] | None:
     """Azimuths on the plan of the left and right ends of the image's middle row; None without rays there."""
-    rays = middle_row_ends(camera)
-    if rays is None:
+    if (rays := middle_row_ends(camera)) is None:
         return None
     flat = _flat(result, (rays @ result.rotation[c]).numpy())
     if float(np.linalg.norm(flat, axis=-1).min()) < 1e-6:
@@ -167,10 +160,9 @@ def _edges(result: RigResult, c: int, camera: Camera) -> tuple[float, float] | N
 def _draw_items(axes: Axes, result: RigResult) -> None:
     """A bar for each item: the worst ones where there are many."""
     items = sorted(result.items, key=lambda item: (item.source, item.used, -item.sigmas))
-    if len(items) > _ROWS:
-        wrong = [item for item in items if not item.used]
-        good = sorted((item for item in items if item.used), key=lambda item: -item.sigmas)
-        items = sorted((wrong + good)[:_ROWS], key=lambda item: (item.source, item.used, -item.sigmas))
+    # What was left out, and then the worst.
+    items = sorted(items, key=lambda item: (item.used, -item.sigmas if item.used else 0.0))[:_ROWS]
+    items = sorted(items, key=lambda item: (item.source, item.used, -item.sigmas))
     limit = max([3.5, *(min(item.sigmas, 8.0) for item in items)]) * 1.05
     for row, item in enumerate(items):
         length = min(item.sigmas, limit)
@@ -235,14 +227,12 @@ def stars_figure(
     style: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "color": figures.ACCENT}
     axes.plot(*pixels[known].T, "o", label=f"{int(known.sum())} named", **style)
     for place, name in [(at, name) for at, name in zip(pixels, names, strict=True) if name][:_MOST_NAMES]:
-        figures.name_point(
-            axes, place, name, (7 if place[0] < _NEAR_EDGE * width else -7, -3), fontsize=7, va="baseline"
-        )
+        beside = 7 if place[0] < _NEAR_EDGE * width else -7, -3
+        figures.name_point(axes, place, name, beside, fontsize=7, va="baseline")
     if known.any():
-        longest = max(float(np.linalg.norm(residual[known], axis=1).max()), 1e-3)
-        figures.draw_arrows(
-            axes, pixels[known], residual[known], 0.04 * width / longest, color=figures.WARN, width=0.0015
-        )
+        off = residual[known]
+        scale = 0.04 * width / max(float(np.linalg.norm(off, axis=1).max()), 1e-3)
+        figures.draw_arrows(axes, pixels[known], off, scale, color=figures.WARN, width=0.0015)
     axes.legend(loc="lower right", fontsize=8)
     return figures.finished(axes)
 
@@ -290,14 +280,12 @@ def skyline_figure(images: Sequence[tuple[str, NDArray[Any]]], found: Sequence[S
         axes.set(ylim=(high - 0.5, low - 0.5), xlabel="")
         axes.plot(column, one.expected, color=figures.ACCENT, linewidth=1.0, label="raster")
         left_out = one.border.clear & ~one.used
-        axes.plot(
-            column[left_out], one.border.row[left_out], ".", color=figures.WARN, markersize=2, label="image, left out"
-        )
+        style: dict[str, Any] = {"color": figures.WARN, "markersize": 2, "label": "image, left out"}
+        axes.plot(column[left_out], one.border.row[left_out], ".", **style)
         axes.legend(loc="lower right", fontsize=7)
-        angles = zip(
-            ("heading", "pitch", "roll"), (one.heading_deg, one.pitch_deg, one.roll_deg), one.sigma_deg, strict=True
-        )
-        text = ", ".join(f"{angle} {value:.3f} ± {sigma:.3f}°" for angle, value, sigma in angles)
+        angles = (("heading", one.heading_deg), ("pitch", one.pitch_deg), ("roll", one.roll_deg))
+        named = zip(angles, one.sigma_deg, strict=True)
+        text = ", ".join(f"{angle} {value:.3f} ± {sigma:.3f}°" for (angle, value), sigma in named)
         axes.set_title(f"{name}: {text}", fontsize=9, color=figures.INK, loc="left")
         off = one.expected - one.border.row
         for part, color in ((one.used, figures.ACCENT), (left_out, figures.WARN)):
@@ -347,19 +335,14 @@ def attitude_figure(
     figure = figures.framed_figure(9.0, 6.3, title)
     panels = figure.subplots(3, 1, sharex=True)
     for axes, name, middle, wide in zip(panels, _ANGLES, angle.T, 1.96 * sigma.T, strict=True):
-        axes.fill_between(
-            along, middle - wide, middle + wide, color=figures.ACCENT, alpha=0.25, linewidth=0, label="95 %"
-        )
+        band: dict[str, Any] = {"color": figures.ACCENT, "alpha": 0.25, "linewidth": 0, "label": "95 %"}
+        axes.fill_between(along, middle - wide, middle + wide, **band)
         axes.plot(along, middle, color=figures.ACCENT, linewidth=1.0)
-        for sign in (-1.0, 1.0):
-            axes.axhline(
-                sign * limit, color=figures.WARN, linewidth=0.8, linestyle="--", label="limit" if sign > 0 else None
-            )
+        for end, label in ((-limit, None), (limit, "limit")):
+            axes.axhline(end, color=figures.WARN, linewidth=0.8, linestyle="--", label=label)
         if not seen.all():
-            low = axes.get_ylim()[0]
-            axes.plot(
-                along[~seen], np.full(int((~seen).sum()), low), "|", color=figures.INK, markersize=6, label="not seen"
-            )
+            gaps, low = along[~seen], axes.get_ylim()[0]
+            axes.plot(gaps, np.full_like(gaps, low), "|", color=figures.INK, markersize=6, label="not seen")
             axes.set_ylim(bottom=low)
         axes.set_ylabel(f"{name}, degrees")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", fontsize=8, ncols=3, frameon=False)

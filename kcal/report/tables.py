@@ -30,11 +30,10 @@ def position_rows(located: Located, off: list[tuple[float, float, bool] | None] 
         rows[0][-1:-1] = [f"off level {unit.name}", f"off in range {unit.name}", "in interval"]
         for row, position, miss in zip(rows[1:], located.positions, off, strict=True):
             sigma = range_sigma(position)
-            row[-1:-1] = (
-                ["", "", ""]
-                if miss is None
-                else [unit.number(miss[0], sigma), unit.number(miss[1], sigma, sign=True), "yes" if miss[2] else "no"]
-            )
+            row[-1:-1] = ["", "", ""]
+            if miss is not None:
+                level, along = unit.number(miss[0], sigma), unit.number(miss[1], sigma, sign=True)
+                row[-4:-1] = [level, along, "yes" if miss[2] else "no"]
     return rows
 
 
@@ -88,35 +87,24 @@ def truth_rows(located: Located, noiseless: Located, truth: Tensor) -> list[list
         truth: (N, 3) true east, north, up, meters.
     """
     unit = range_unit(located)
-    lengths = (
-        f"{word} {unit.name}" for word in ("true", "estimate", "95 % interval", "error", "across", "calibration")
+    first, last = (
+        [f"{word} {unit.name}" for word in words]
+        for words in (("true", "estimate", "95 % interval"), ("across", "calibration"))
     )
-    true_head, estimate_head, interval_head, error_head, across_head, calibration_head = lengths
-    rows = [
-        ["target", true_head, estimate_head, interval_head, "truth is", error_head, "%", across_head, calibration_head]
-    ]
-    for position, exact, true, miss in zip(
-        located.positions, noiseless.positions, truth, position_errors(located, truth), strict=True
-    ):
+    rows = [["target", *first, "truth is", f"error {unit.name}", "%", *last]]
+    misses = position_errors(located, truth)
+    for position, exact, true, miss in zip(located.positions, noiseless.positions, truth, misses, strict=True):
         distance, sigma = float(true.norm()), range_sigma(position)
         if position.enu is None or position.range_m is None or miss is None:
             rows.append([position.name, unit.number(distance, sigma), *["-"] * 6, position.reason])
             continue
         along, across = _along_and_across(position, true)
         share = None if sigma is None else 100.0 * sigma / distance
-        rows.append(
-            [
-                position.name,
-                unit.number(distance, sigma),
-                unit.number(position.range_m, sigma),
-                interval_text(position, unit),
-                "inside" if miss[2] else "outside",
-                unit.number(along, sigma, sign=True),
-                number_text(100.0 * along / distance, share, sign=True),
-                unit.number(across, digits=2),
-                "-" if exact.enu is None else unit.number(_along_and_across(exact, true)[0], sigma, sign=True),
-            ]
-        )
+        ranges = [unit.number(distance, sigma), unit.number(position.range_m, sigma), interval_text(position, unit)]
+        errors = [unit.number(along, sigma, sign=True), number_text(100.0 * along / distance, share, sign=True)]
+        errors.append(unit.number(across, digits=2))
+        alone = "-" if exact.enu is None else unit.number(_along_and_across(exact, true)[0], sigma, sign=True)
+        rows.append([position.name, *ranges, "inside" if miss[2] else "outside", *errors, alone])
     return rows
 
 
@@ -168,15 +156,11 @@ def range_sigma_rows(found: RangeSigmas, known: bool = True) -> list[list[str]]:
     rows = [["at", "σ of range", "marks", "lenses", "relative pose", "mounting, sideways"]]
     for distance, marks, lenses, pose, total, ranged, sideways in zip(*(part.tolist() for part in found), strict=True):
         cells = [length_text(part, digits=2) for part in (total, marks, lenses, pose)]
-        if not known:
+        if not ranged:
+            cells = ["bearing only", "", "", ""]
+        elif not known:
             cells = ["not known", cells[1], "not known", "not known"]
-        rows.append(
-            [
-                range_text(distance),
-                *(cells if ranged else ["bearing only", "", "", ""]),
-                length_text(sideways, digits=2),
-            ]
-        )
+        rows.append([range_text(distance), *cells, length_text(sideways, digits=2)])
     return rows
 
 

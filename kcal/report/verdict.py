@@ -249,11 +249,6 @@ def weighed_findings(
     Without requirements, one that makes the camera `wrong` by more than its error bars is.
     """
     breaks = any(answer.fails_by(FAULTS) for answer in answers) or (wrong and not answers)
-    return sorted_findings(
-        [
-            dataclasses.replace(finding, severity="stop")
-            if breaks and finding.part == FAULTS and finding.severity == "doubt"
-            else finding
-            for finding in findings
-        ]
-    )
+    worse = [breaks and one.part == FAULTS and one.severity == "doubt" for one in findings]
+    both = zip(findings, worse, strict=True)
+    return sorted_findings(dataclasses.replace(one, severity="stop") if bad else one for one, bad in both)

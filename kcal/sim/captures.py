@@ -109,8 +109,7 @@ def check_draws(count: int, name: str, limits: tuple[float, float]) -> None:
         raise InputError(f"{name} {limits}: two positive numbers are needed, the smaller first")
 
 
-@dataclass(frozen=True, kw_only=True)
-class DrawnPoses:
+class DrawnPoses(NamedTuple):
     """Random poses, and where they lie in the space in which they are to be spread out (draws, 3)."""
 
     rotation: Tensor
@@ -146,12 +145,9 @@ def draw_poses(
     points = board_points(board)
     middle = 0.5 * (points[0] + points[-1])
     translation = center - rotation @ middle
-    features = [
-        tilt / max(options.max_tilt, 1e-9) * torch.cos(towards),
-        tilt / max(options.max_tilt, 1e-9) * torch.sin(towards),
-        random[:, 2],
-    ]
-    return DrawnPoses(rotation=rotation, translation=translation, features=0.4 * torch.stack(features, -1))
+    share = tilt / max(options.max_tilt, 1e-9)
+    features = 0.4 * torch.stack([share * torch.cos(towards), share * torch.sin(towards), random[:, 2]], -1)
+    return DrawnPoses(rotation, translation, features)
 
 
 def choose_poses(
@@ -326,10 +322,7 @@ def drawn_rig(
         drawn_lens(lens, strength, 2 * seed + side, focal_mm=focal_mm, wander=wander, scale=scale) for side in (0, 1)
     )
     return TrueRig(
-        left=left,
-        right=right,
-        right_from_left_rotation=rotation,
-        right_from_left_translation=-rotation @ center,
+        left=left, right=right, right_from_left_rotation=rotation, right_from_left_translation=-rotation @ center
     )
 
 

@@ -191,10 +191,7 @@ def practice_truth(site: PracticeSite, frames: int) -> dict[str, Any]:
         "marks": {
             name: [*pixels["left"][row].tolist(), *pixels["right"][row].tolist()] for row, name in enumerate(things)
         },
-        "ships": {
-            "times": [number / RATE for number in range(frames)],
-            "places": _ship_places(site, frames),
-        },
+        "ships": {"times": [number / RATE for number in range(frames)], "places": _ship_places(site, frames)},
     }
 
 
@@ -340,14 +337,11 @@ def _with_ships(
 
 
 def _ship_window(windows: list[tuple[slice, slice]], shape: tuple[int, ...]) -> tuple[slice, slice]:
-    sides = [
-        slice(
-            max(0, min(window[axis].start for window in windows) - _AROUND),
-            min(shape[axis], max(window[axis].stop for window in windows) + _AROUND),
-        )
-        for axis in (0, 1)
-    ]
-    return sides[0], sides[1]
+    down, across = (
+        slice(max(0, min(own.start for own in side) - _AROUND), min(size, max(own.stop for own in side) + _AROUND))
+        for side, size in zip(zip(*windows, strict=True), shape, strict=True)
+    )
+    return down, across
 
 
 def _meet(first: tuple[slice, slice], second: tuple[slice, slice]) -> bool:
@@ -386,7 +380,5 @@ def night_picture(site: PracticeSite, side: Side, directions: Floats, magnitudes
             flux = _BRIGHTEST * 10.0 ** (-0.4 * magnitude) / (2 * np.pi * _STAR_BLUR**2)
             light[y[0] : y[-1] + 1, x[0] : x[-1] + 1] += flux * profile
     random = np.random.default_rng([site.scene.seed, SIDES.index(side), 4])
-    levels: NDArray[np.uint8] = np.clip(np.rint(light + NOISE * random.standard_normal(light.shape)), 0, 255).astype(
-        np.uint8
-    )
-    return levels
+    noisy = light + NOISE * random.standard_normal(light.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)

@@ -200,10 +200,7 @@ def render_board(
 
 @torch.no_grad()
 def render_light(
-    camera: LensLike,
-    cam_from_board: tuple[Tensor, Tensor],
-    board: BoardLike,
-    options: RenderOptions | None = None,
+    camera: LensLike, cam_from_board: tuple[Tensor, Tensor], board: BoardLike, options: RenderOptions | None = None
 ) -> Tensor:
     """Render the image as it falls on the sensor, before noise and rounding: (height, width) float64 gray levels.
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.pose import rotation_from_vector
-from kcal.sim.raytrace import Misalignment, Placed, Prescription, focal_length, place, trace
+from kcal.sim.raytrace import Misalignment, Prescription, focal_length, place, trace
 
 # Rectangles of pixels.
 
@@ -62,7 +62,8 @@ class ChebyshevTable:
     def values(self, pixels: Tensor) -> Tensor:
         """Return the values (N, K) at pixels (N, 2)."""
         across, down = (self._basis(pixels, axis)[0] for axis in (0, 1))
-        return self._sum(across, down)
+        left = (across @ self.coefficients.flatten(1)).unflatten(-1, self.coefficients.shape[1:])
+        return (left @ down[..., None])[..., 0]
 
     def with_slopes(self, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return values (N, K), and their derivatives by x and by y, per pixel."""
@@ -73,10 +74,6 @@ class ChebyshevTable:
             (part @ basis[..., None])[..., 0] for part, basis in ((left, down), (left_slope, down), (left, down_slope))
         ]
         return sums[0], sums[1], sums[2]
-
-    def _sum(self, across: Tensor, down: Tensor) -> Tensor:
-        left = (across @ self.coefficients.flatten(1)).unflatten(-1, self.coefficients.shape[1:])
-        return (left @ down[..., None])[..., 0]
 
     def _basis(self, pixels: Tensor, axis: int) -> tuple[Tensor, Tensor]:
         """Chebyshev polynomials (N, degree + 1) along an axis, and their derivatives per pixel."""
@@ -143,13 +140,12 @@ class LinesOfSight(NamedTuple):
         return torch.linalg.solve(across.sum(0), (across @ at[..., None])[..., 0].sum(0))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class ChiefRays:
-    """A lens with its sensor; see `build`.
+    """A lens of `focal_mm` millimeters before a sensor on which that is `focal` pixels.
 
     Convention: the camera frame (x right, y down, z forward, meters) has its origin in the front vertex.
 
-    Args:
+    Attributes:
         surfaces: of the lens, in meters.
         stop: place of the aperture stop among them.
         sensor: its vertex (3,) and rotation (3, 3) in the lens's frame.
@@ -158,39 +154,18 @@ class ChiefRays:
         name: for messages.
     """
 
-    surfaces: list[Placed]
-    stop: int
-    sensor: tuple[Tensor, Tensor]
-    axis: Tensor
-    pitch: float
-    name: str
-
-    @staticmethod
-    def build(
-        prescription: Prescription,
-        *,
-        focal: float,
-        focal_mm: float,
-        axis: tuple[float, float],
-        misalignment: Misalignment,
-        sensor_tilt: tuple[float, float],
-    ) -> ChiefRays:
-        """Place a lens of `focal_mm` millimeters before a sensor on which that is `focal` pixels."""
+    def __init__(
+        self, prescription: Prescription, focal: float, focal_mm: float, axis: tuple[float, float],
+        misalignment: Misalignment, sensor_tilt: tuple[float, float],
+    ) -> None:  # fmt: skip
         scale = 1e-3 * focal_mm / focal_length(prescription)
-        surfaces = place(prescription, 1e-3 * focal_mm, scale, misalignment)
+        self.surfaces = place(prescription, 1e-3 * focal_mm, scale, misalignment)
+        self.stop, self.name, self.pitch = prescription.stop, prescription.name, 1e-3 * focal_mm / focal
+        self.axis = torch.tensor(axis, dtype=torch.float64)
         # Misalignment moves pieces of glass, not the barrel.
         length = scale * sum(surface.thickness for surface in prescription.surfaces)
-        return ChiefRays(
-            surfaces=surfaces,
-            stop=prescription.stop,
-            sensor=(
-                torch.tensor([0.0, 0.0, length], dtype=torch.float64),
-                rotation_from_vector(torch.tensor([*sensor_tilt, 0.0], dtype=torch.float64)),
-            ),
-            axis=torch.tensor(axis, dtype=torch.float64),
-            pitch=1e-3 * focal_mm / focal,
-            name=prescription.name,
-        )
+        turn = rotation_from_vector(torch.tensor([*sensor_tilt, 0.0], dtype=torch.float64))
+        self.sensor = torch.tensor([0.0, 0.0, length], dtype=torch.float64), turn
 
     def lines(self, pixels: Tensor) -> LinesOfSight:
         """Find the lines of sight of pixels (N, 2), in front of the lens.
@@ -334,14 +309,9 @@ class TruthLens:
             raise InputError(f"image size {size}: width and height must be positive")
         self.size = (int(size[0]), int(size[1]))
         self._focal, self._wander = float(focal), float(wander)
-        self._chief = ChiefRays.build(
-            prescription,
-            focal=self._focal,
-            focal_mm=focal_mm,
-            axis=center or ((size[0] - 1) / 2, (size[1] - 1) / 2),
-            misalignment=misalignment or Misalignment(),
-            sensor_tilt=sensor_tilt,
-        )
+        axis = center or ((size[0] - 1) / 2, (size[1] - 1) / 2)
+        glass = misalignment or Misalignment()
+        self._chief = ChiefRays(prescription, self._focal, focal_mm, axis, glass, sensor_tilt)
         self._origin = self._chief.lines(self._probe(17)).nearest_point()
         self._window = PixelRectangle(
             -_TABLE_MARGIN, -_TABLE_MARGIN, self.size[0] + 2 * _TABLE_MARGIN, self.size[1] + 2 * _TABLE_MARGIN

@@ -257,12 +257,10 @@ def taken(state: TurnState, look: Look, model: TurnModel, rows: Tensor) -> TurnS
     share = look.lasting[..., None]
     own = look.covariance.diagonal(dim1=-2, dim2=-1)
     first = (state.lasting == 0).all(-1, keepdim=True)
-    variance = state.covariance.diagonal(dim1=-2, dim2=-1).clone()
+    spread = state.covariance.clone()
+    lasting = spread.diagonal(dim1=-2, dim2=-1)[..., _LASTING]
     # The first measurement tells how much may last.
-    variance[..., _LASTING] = torch.where(first, share * own, variance[..., _LASTING])
-    spread = (
-        state.covariance - torch.diag_embed(state.covariance.diagonal(dim1=-2, dim2=-1)) + torch.diag_embed(variance)
-    )
+    lasting.copy_(torch.where(first, share * own, lasting))
     design, noise, wanted, there = _rows_of(look, model, rows)
     off = torch.where(there, wanted - (design @ state.mean[..., None])[..., 0], 0.0)
 
@@ -274,7 +272,7 @@ def taken(state: TurnState, look: Look, model: TurnModel, rows: Tensor) -> TurnS
     strikes = torch.where(strange, state.strikes + 1.0, 0.0)
     believed = strange & (strikes >= _AGREE)
     jump = torch.where(there[..., :6], off[..., :6], 0.0)
-    wider = torch.zeros_like(variance)
+    wider = torch.zeros_like(state.mean)
     wider[..., _SLOW] = torch.where(believed[..., None], jump**2, 0.0)
     spread = spread + torch.diag_embed(wider)
     gain = torch.linalg.solve(innovation(spread), design @ spread).mT

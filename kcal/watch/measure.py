@@ -77,8 +77,7 @@ class FixedFeatures:
 
     def at(self, which: Tensor) -> FixedFeatures:
         """Some of the features."""
-        own = {name: getattr(self, name)[which] for name in _FIELDS[:-1]}
-        return dataclasses.replace(self, **own)
+        return dataclasses.replace(self, **{name: getattr(self, name)[which] for name in _FIELDS[:-1]})
 
 
 def new_reference(image: Gray, name: str) -> FixedFeatures:
@@ -305,14 +304,8 @@ def seen_by(camera: Camera, reference: FixedFeatures, image: Gray, turn: Tensor,
         both = float((off[old] * reference.off[old]).sum()), float(off[old].square().sum())
         lasting = min(0.95, max(0.05, both[0] / both[1]))
     few = f"{name}: only {int(used.sum())} features" if 4 * int(used.sum()) < len(good) else ""
-    return Seen(
-        found.vector,
-        found.covariance + reference.variance,
-        int(used.sum()),
-        lasting,
-        with_look(reference, good, off),
-        few,
-    )
+    covariance = found.covariance + reference.variance
+    return Seen(found.vector, covariance, int(used.sum()), lasting, with_look(reference, good, off), few)
 
 
 def _is_full(image: Gray) -> bool:
@@ -440,12 +433,8 @@ def measured(
     Raises:
         InputError: another camera or lens.
     """
-    sides = [
-        seen_by(camera, reference, image, turns[3 * k : 3 * k + 3], name)
-        for k, (camera, reference, image, name) in enumerate(
-            zip((rig.left, rig.right), references, images, ("left", "right"), strict=True)
-        )
-    ]
+    each = zip((rig.left, rig.right), references, images, turns.split(3), ("left", "right"), strict=True)
+    sides = [seen_by(*one) for one in each]
     told = [side.lasting for side in sides if side.lasting is not None]
     seen = torch.tensor([side.found > 0 for side in sides])
     look = no_look()._replace(

@@ -251,10 +251,9 @@ class Drift:
     def turns(self) -> tuple[tuple[str, Tensor, Tensor], ...]:
         """What has turned, by how much (3,) and with which covariance (3, 3); without what cannot be told."""
         every = (
-            ("left camera", self.left, self.left_covariance),
-            ("right camera", self.right, self.right_covariance),
+            ("left camera", self.left, self.left_covariance), ("right camera", self.right, self.right_covariance),
             ("right from left", self.relative, self.relative_covariance),
-        )
+        )  # fmt: skip
         return tuple((name, turn, cov) for name, turn, cov in every if turn is not None and cov is not None)
 
     def effect(self, distances: Sequence[float] | None = None) -> DriftEffect:
@@ -422,17 +421,12 @@ def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift
         off = {name: length for name, length in off.items() if math.isfinite(length)}
         moved = ", ".join(f"{length:.1f} px ({name})" for name, length in off.items())
         reason = f"it has moved by {moved}" if off else "no camera has a mark of it both then and now"
-        items.append(
-            ItemResidual(
-                source="features",
-                name=feature,
-                pixels=tuple(off.get(name) for name in _NAMES),
-                sigmas=math.hypot(*sigmas) / math.sqrt(2 * len(sigmas)) if sigmas else math.inf,
-                over_limit=float(found.over_limit[i]),
-                used=bool(found.used[i]),
-                reason="" if found.used[i] else reason,
-            )
-        )
+        typical = math.hypot(*sigmas) / math.sqrt(2 * len(sigmas)) if sigmas else math.inf
+        over, used = float(found.over_limit[i]), bool(found.used[i])
+        items.append(ItemResidual(
+            source="features", name=feature, pixels=tuple(off.get(name) for name in _NAMES), sigmas=typical,
+            over_limit=over, used=used, reason="" if used else reason,
+        ))  # fmt: skip
     vectors, covariances = zip(*((turn.vector, turn.covariance) for turn in found.each), strict=True)
     return drift_of_turns(
         rig, torch.cat(vectors), torch.block_diag(*covariances), cam_from_local, items=tuple(items),

@@ -425,9 +425,8 @@ class Watcher:
         try:
             if self._ledger.place.sequence:
                 self._rows.extend(past.read_history(history, rig.fingerprint))
-                first = [row.temperature for row in self._rows if not math.isnan(row.temperature)]
-                self._warmth = self._warmth if not first else first[0] - float(
-                    next(row.look.kelvin for row in self._rows if not math.isnan(row.temperature)))  # fmt: skip
+                known = (row for row in self._rows if not math.isnan(row.temperature))
+                self._warmth = next((row.temperature - float(row.look.kelvin) for row in known), math.nan)
             if self.reference.exists():
                 self._sides = measure.load_references(self.reference, rig)
             elif self._rows:
@@ -544,20 +543,13 @@ class Watcher:
 
     def _renew(self, left: Gray, right: Gray) -> None:
         assert self._sides is not None
-        turns = self.watched.turns_at(self.last_time)
-        seen = self._rows[-1].look.seen.tolist()
-        sides = [
-            measure.renewed(side, camera, image, turns.mean[part], turns.covariance[part, part]) if there else side
-            for side, camera, image, there, part in zip(
-                self._sides,
-                (self.rig.left, self.rig.right),
-                (left, right),
-                seen,
-                (slice(0, 3), slice(3, 6)),
-                strict=True,
-            )
-        ]
-        self._sides = sides[0], sides[1]
+        turns, seen = self.watched.turns_at(self.last_time), self._rows[-1].look.seen.tolist()
+        known = turns.mean[:3], turns.covariance[:3, :3], turns.mean[3:], turns.covariance[3:, 3:]
+        one, other = self._sides
+        self._sides = (
+            measure.renewed(one, self.rig.left, left, *known[:2]) if seen[0] else one,
+            measure.renewed(other, self.rig.right, right, *known[2:]) if seen[1] else other,
+        )
         # Before the journal: a reference that is ahead of the history does no harm.
         measure.save_references(self.reference, self.rig, self._sides)
         self._ledger.checkpoint({"rig": self.rig.fingerprint})

@@ -87,10 +87,7 @@ def local_app(
     return Starlette(
         routes=[*routes, *own],
         middleware=[Middleware(_Gate, token=token, hosts=hosts)],
-        exception_handlers={
-            KcalError: _refuse,
-            pydantic.ValidationError: _refuse,
-        },
+        exception_handlers={KcalError: _refuse, pydantic.ValidationError: _refuse},
     )
 
 
