@@ -71,14 +71,6 @@ def test_each_image_is_read_once(shots, monkeypatch):
     assert sorted(read) == sorted(shots.iterdir())
 
 
-def test_sixteen_bit_images(shots, tmp_path):
-    for path in shots.iterdir():
-        cv2.imwrite(str(path), cv2.imread(str(path), 0).astype(np.uint16) * 257)
-    output = tmp_path / "x.obs.json"
-    assert kcal("detect", shots, *OPTIONS, output).exit_code == 0
-    assert len(Observations.load(output).views) == 2
-
-
 @pytest.mark.parametrize("method", ["saddle", "opencv", "skimage", "none"])
 def test_refine_is_recorded(shots, tmp_path, method):
     output = tmp_path / "x.obs.json"
