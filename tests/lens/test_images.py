@@ -12,13 +12,12 @@ import pytest
 import torch
 from image_cameras import BARREL, F64, LITTLE, OTHER, PINCUSHION, SMALL, build
 from kornia.geometry.transform import remap
-from lenses import HYBRID, strong
+from lenses import NAMED, camera_of
 from torch import Tensor
 
 from kcal import Camera, InputError
 from kcal.lens import CameraCalibration, ImageTransform, Undistort, undistort_maps
 from kcal.lens.camera_like import project_each, stackable, unproject_each
-from kcal.lens.model import PRESETS
 from kcal.lens.projection import project_components
 from kcal.lens.views import new_pinhole, source_pixels
 
@@ -269,16 +268,10 @@ TRANSFORMS = {
 }
 
 
-def camera_of(name: str) -> Camera:
-    model = HYBRID if name == "hybrid" else PRESETS[name]
-    lens = torch.tensor([0.02, -0.01, 0.003, -0.0005]) if model.fisheye else 0.3 * strong(model)
-    return Camera(torch.cat([torch.tensor([1600.0, 1610.0, 955.0, 541.0, 2.0]), lens]).double(), size=FULL, model=model)
-
-
 @pytest.mark.parametrize("transform", TRANSFORMS.values(), ids=TRANSFORMS)
 @pytest.mark.parametrize("lens", ["opencv5", "opencv14", "fisheye4", "hybrid"])
 def test_the_camera_of_the_input_sees_the_pixels_of_the_input(lens: str, transform: ImageTransform) -> None:
-    camera = camera_of(lens)
+    camera = camera_of(lens, 0.3)
     pixels = torch.stack([torch.linspace(400, 900, 40), torch.linspace(250, 600, 40)], -1).double()
     rays, valid = camera.unproject(pixels)
     seen, also = camera.transformed(transform).project_rays(rays)
@@ -327,7 +320,7 @@ def test_small_images_may_stay_small_and_padding_may_go_to_one_side() -> None:
 
 
 def test_methods_of_the_camera() -> None:
-    camera = camera_of("opencv5")
+    camera = camera_of("opencv5", 0.3)
     assert camera.resized((960, 540)).focal.tolist() == [800.0, 805.0]
     assert camera.cropped(100, 50, (640, 480)).center.tolist() == [855.0, 491.0]
     assert camera.letterboxed((640, 640)).size == (640, 640)
@@ -335,7 +328,7 @@ def test_methods_of_the_camera() -> None:
 
 def test_error_bars_travel_exactly() -> None:
     """The sigma of a projected pixel, in input pixels, is that of the full image times the scale."""
-    camera = camera_of("opencv5")
+    camera = camera_of("opencv5", 0.3)
     root = torch.randn(10, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 1e-3
     names = dict.fromkeys(camera.names, 0.5) | {"skew": None}
     camera.calibration = CameraCalibration(name="left", sigma=names, covariance=root @ root.T)
@@ -368,7 +361,10 @@ def _with(camera: Camera, values: torch.Tensor) -> Camera:
     [
         (lambda: ImageTransform.crop(FULL, 1900, 0, (640, 480)), "does not lie inside"),
         (lambda: ImageTransform.resize(FULL, (0, 640)), "must be positive"),
-        (lambda: camera_of("opencv5").transformed(ImageTransform.resize((640, 480), (320, 240))), "the camera has"),
+        (
+            lambda: camera_of("opencv5", 0.3).transformed(ImageTransform.resize((640, 480), (320, 240))),
+            "the camera has",
+        ),
         (lambda: TRANSFORMS["crop"].then(TRANSFORMS["resize"]), "the second begins with"),
         (lambda: TRANSFORMS["crop"].to_full(torch.ones(3, 2, dtype=torch.int64)), "floating point"),
     ],
@@ -381,18 +377,8 @@ def test_what_cannot_be(make: object, message: str) -> None:
 # Cameras in one call give what each gives alone.
 
 
-NAMED = {**PRESETS, "hybrid": HYBRID}
-
-
 def make_camera(preset: str, focal: float) -> Camera:
-    model = NAMED[preset]
-    lens = (
-        torch.tensor([0.02, -0.01, 0.003, -0.0005], dtype=torch.float64) if model.fisheye else torch.zeros(0).double()
-    )
-    if model.size and not model.fisheye:
-        lens = 0.3 * focal / 1600 * strong(model)
-    head = torch.tensor([focal, focal + 9.0, 955.0, 541.0, 2.0], dtype=torch.float64)
-    return Camera(torch.cat([head, lens]), size=(1920, 1080), model=model)
+    return camera_of(preset, 0.3 * focal / 1600, focal)
 
 
 def some_pixels(*shape: int) -> Tensor:
