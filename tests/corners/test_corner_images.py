@@ -95,16 +95,12 @@ def test_decoding_without_an_error_stream(picture):
     assert (image == picture).all()
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "the file is empty"),
-        (b"these are words, no image", "not an image"),
-        (encoded(np.arange(64, dtype=np.uint8).reshape(8, 8), ".png"), "8x8 pixels are too few"),
-        (encoded(np.full((50, 50), 128, np.uint8), ".png"), "same gray level"),
-        (encoded(np.random.default_rng(0).random((50, 50), np.float32), ".tiff"), "float32"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    (b"", "the file is empty"), (b"these are words, no image", "not an image"),
+    (encoded(np.arange(64, dtype=np.uint8).reshape(8, 8), ".png"), "8x8 pixels are too few"),
+    (encoded(np.full((50, 50), 128, np.uint8), ".png"), "same gray level"),
+    (encoded(np.random.default_rng(0).random((50, 50), np.float32), ".tiff"), "float32"),
+])  # fmt: skip
 def test_useless_files_say_why(tmp_path, content, message):
     path = tmp_path / "x.png"
     path.write_bytes(content)
@@ -233,19 +229,11 @@ def test_most_images_decide_and_then_the_largest() -> None:
     assert common_size("ad", [(640, 360), (640, 360)]) == ((640, 360), {}, {}, ())
 
 
-@pytest.mark.parametrize(
-    ("one", "other", "alike"),
-    [
-        ((1500, 1000), (640, 427), True),
-        ((1500, 1000), (640, 426), True),
-        ((1500, 1000), (640, 425), False),
-        ((6016, 4016), (3008, 2008), True),
-        ((640, 480), (640, 360), False),
-        ((640, 480), (480, 640), False),
-        ((640, 480), (639, 479), False),
-        ((640, 480), (640, 479), False),
-    ],
-)
+@pytest.mark.parametrize(("one", "other", "alike"), [
+    ((1500, 1000), (640, 427), True), ((1500, 1000), (640, 426), True), ((1500, 1000), (640, 425), False),
+    ((6016, 4016), (3008, 2008), True), ((640, 480), (640, 360), False), ((640, 480), (480, 640), False),
+    ((640, 480), (639, 479), False), ((640, 480), (640, 479), False),
+])  # fmt: skip
 def test_which_sizes_are_alike(one, other, alike) -> None:
     assert resized_alike(one, other) is alike
     assert resized_alike(other, one) is alike
@@ -263,15 +251,12 @@ def test_sides_that_were_rounded_have_scales_of_their_own() -> None:
     assert view.covariance[0] == pytest.approx((x * x, 0.5 * x * y, 2.0 * y * y))
 
 
-@pytest.mark.parametrize(
-    ("sizes", "left_out"),
-    [
-        ([(640, 480), (640, 480), (640, 360)], "640x360 px, not the 640x480 px of most images: cropped or of another"),
-        ([(640, 480), (640, 480), (480, 640)], "480x640 px, not the 640x480 px of most images: turned by 90 degrees"),
-        ([(640, 480), (320, 240), (240, 320)], "240x320 px, not the 640x480 px of most images: turned by 90 degrees"),
-        ([(1281, 721), (1280, 720), (1280, 724)], "1280x724 px, not the 1281x721 px"),
-    ],
-)
+@pytest.mark.parametrize(("sizes", "left_out"), [
+    ([(640, 480), (640, 480), (640, 360)], "640x360 px, not the 640x480 px of most images: cropped or of another"),
+    ([(640, 480), (640, 480), (480, 640)], "480x640 px, not the 640x480 px of most images: turned by 90 degrees"),
+    ([(640, 480), (320, 240), (240, 320)], "240x320 px, not the 640x480 px of most images: turned by 90 degrees"),
+    ([(1281, 721), (1280, 720), (1280, 724)], "1280x724 px, not the 1281x721 px"),
+])  # fmt: skip
 def test_what_is_left_out(sizes, left_out) -> None:
     found = common_size("abc", sizes)
     assert found.size == sizes[0]
@@ -280,17 +265,11 @@ def test_what_is_left_out(sizes, left_out) -> None:
     assert found.notes[-1].startswith("1 of 3 images were left out, because their size is not")
 
 
-@pytest.mark.parametrize(
-    ("sizes", "message"),
-    [
-        (
-            [(640, 480), (640, 360)],
-            r"1 of 640x480 px \(a\); 1 of 640x360 px \(b\); detect those of each size",
-        ),
-        ([(640, 480), (480, 640), None], "turn back those that were turned by 90 degrees, or detect"),
-        ([(640, 480), (640, 480), (640, 360), (500, 360)], "none has more than half: 2 of 640x480"),
-    ],
-)
+@pytest.mark.parametrize(("sizes", "message"), [
+    ([(640, 480), (640, 360)], r"1 of 640x480 px \(a\); 1 of 640x360 px \(b\); detect those of each size"),
+    ([(640, 480), (480, 640), None], "turn back those that were turned by 90 degrees, or detect"),
+    ([(640, 480), (640, 480), (640, 360), (500, 360)], "none has more than half: 2 of 640x480"),
+])  # fmt: skip
 def test_no_size_of_most_is_refused_with_counts(sizes, message) -> None:
     with pytest.raises(InputError, match=message):
         common_size("abcd"[: len(sizes)], sizes)

@@ -186,17 +186,11 @@ class TestBoard:
         assert Board.parse("charuco:7x5", "1cm").unambiguous
         assert not Board.parse("7x5", "1cm").unambiguous
 
-    @pytest.mark.parametrize(
-        ("size", "message"),
-        [
-            ("charuco:9", "COLUMNSxROWS"),
-            ("charuco:9x6:best", "choose one of"),
-            ("charuco:9x6:4x4_50:30mm", "smaller than its square"),
-            ("charuco:9x6:4x4_50:30", "with its unit"),
-            ("charuco:20x20", "markers, dictionary 4x4_50 fewer"),
-            ("charuco:9x6:4x4_50:9mm:x", "charuco:COLUMNSxROWS"),
-        ],
-    )
+    @pytest.mark.parametrize(("size", "message"), [
+        ("charuco:9", "COLUMNSxROWS"), ("charuco:9x6:best", "choose one of"),
+        ("charuco:9x6:4x4_50:30mm", "smaller than its square"), ("charuco:9x6:4x4_50:30", "with its unit"),
+        ("charuco:20x20", "markers, dictionary 4x4_50 fewer"), ("charuco:9x6:4x4_50:9mm:x", "charuco:COLUMNSxROWS"),
+    ])  # fmt: skip
     def test_refusals(self, size, message):
         with pytest.raises(InputError, match=message) as caught:
             Board.parse(size, "25mm")
@@ -248,13 +242,10 @@ class TestDetection:
         for size in ("charuco:6x9", "charuco:8x6", "charuco:10x6"):
             assert detect_board(image, Board.parse(size, "25mm")).reason.startswith("the markers do not lie as on this")
 
-    @pytest.mark.parametrize(
-        ("name", "size", "square", "corners"),
-        [
-            ("captures/single/inverted_charuco.png", "charuco:3x4:4x4_1000:40.5mm", "54mm", 12),
-            ("field/charuco/v2.png", "charuco:16x10:5x5_100:4mm", "8mm", 120),
-        ],
-    )
+    @pytest.mark.parametrize(("name", "size", "square", "corners"), [
+        ("captures/single/inverted_charuco.png", "charuco:3x4:4x4_1000:40.5mm", "54mm", 12),
+        ("field/charuco/v2.png", "charuco:16x10:5x5_100:4mm", "8mm", 120),
+    ])  # fmt: skip
     def test_boards_of_strangers(self, name, size, square, corners, kcal_data):
         board = Board.parse(size, square)
         pixels = detect_board(read_gray(kcal_data / name), board).pixels
@@ -399,18 +390,10 @@ def test_another_size():
         find_charuco(image, Board.parse("charuco:6x9", "25mm"))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "aruco_original",
-        "aruco_mip_36h12",
-        "apriltag_16h5",
-        "apriltag_25h9",
-        "apriltag_36h10",
-        "apriltag_36h11",
-        "7x7_1000",
-    ],
-)
+@pytest.mark.parametrize("name", [
+    "aruco_original", "aruco_mip_36h12", "apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11",
+    "7x7_1000",
+])  # fmt: skip
 def test_dictionaries(name):
     board = Board.parse(f"charuco:6x5:{name}", "25mm")
     image, truth = Paper(board, 0.25).shoot(CAMERA, *pose(board, [0.2, 0.3, 0.1], 0.26), supersample=3)

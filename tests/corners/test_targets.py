@@ -40,23 +40,19 @@ def test_texts():
     assert Board.parse("charuco:9x6:id10:15mm", "25mm").marker == 0.015
 
 
-@pytest.mark.parametrize(
-    ("text", "square", "message"),
-    [
-        ("hexagons:7x6", "25mm", "'hexagons' is no kind of board; choose one of charuco, circles"),
-        ("circles:7x6:30mm", "25mm", "smaller than the distance"),
-        ("circles:7x6:12", "25mm", "diameter '12': write a length with its unit"),
-        ("circles:7x6:12mm:3", "25mm", r"write circles:COLUMNSxROWS\[:DIAMETER\]"),
-        ("asymmetric:4", "25mm", "write asymmetric:COLUMNSxROWS"),
-        ("aprilgrid:6x6:0.3:0.4", "88mm", "write aprilgrid:TAGSxTAGS"),
-        ("aprilgrid:6x6:1.2", "88mm", "gap between tags must not exceed"),
-        ("aprilgrid:300x6", "88mm", "1 to 250 tags each way"),
-        ("aprilgrid:6x6:id560", "88mm", "36 markers from number 560 on, dictionary apriltag_36h11 fewer"),
-        ("charuco:9x6:id20", "25mm", "35 markers from number 20 on, dictionary 4x4_50 fewer"),
-        ("9x6:id3", "25mm", "is no kind of board"),
-        ("9x6", None, "give the side of its squares as well"),
-    ],
-)
+@pytest.mark.parametrize(("text", "square", "message"), [
+    ("hexagons:7x6", "25mm", "'hexagons' is no kind of board; choose one of charuco, circles"),
+    ("circles:7x6:30mm", "25mm", "smaller than the distance"),
+    ("circles:7x6:12", "25mm", "diameter '12': write a length with its unit"),
+    ("circles:7x6:12mm:3", "25mm", r"write circles:COLUMNSxROWS\[:DIAMETER\]"),
+    ("asymmetric:4", "25mm", "write asymmetric:COLUMNSxROWS"),
+    ("aprilgrid:6x6:0.3:0.4", "88mm", "write aprilgrid:TAGSxTAGS"),
+    ("aprilgrid:6x6:1.2", "88mm", "gap between tags must not exceed"),
+    ("aprilgrid:300x6", "88mm", "1 to 250 tags each way"),
+    ("aprilgrid:6x6:id560", "88mm", "36 markers from number 560 on, dictionary apriltag_36h11 fewer"),
+    ("charuco:9x6:id20", "25mm", "35 markers from number 20 on, dictionary 4x4_50 fewer"),
+    ("9x6:id3", "25mm", "is no kind of board"), ("9x6", None, "give the side of its squares as well"),
+])  # fmt: skip
 def test_refused_texts(text, square, message):
     with pytest.raises(InputError, match=message) as caught:
         Board.parse(text, square)
@@ -101,21 +97,11 @@ def test_asymmetric_circles_are_counted_as_opencv_does():
     assert board.extent == pytest.approx((0.14, 0.2))
 
 
-@pytest.mark.parametrize(
-    ("text", "turns"),
-    [
-        ("9x6", (0,)),
-        ("7x5", (0, 2)),
-        ("6x6", (0, 1, 2, 3)),
-        ("7x7", (0, 2)),
-        ("charuco:7x5", (0,)),
-        ("circles:9x6", (0, 2)),
-        ("circles:5x5", (0, 1, 2, 3)),
-        ("asymmetric:4x11", (0,)),
-        ("asymmetric:4x10", (0, 2)),
-        ("aprilgrid:4x4", (0,)),
-    ],
-)
+@pytest.mark.parametrize(("text", "turns"), [
+    ("9x6", (0,)), ("7x5", (0, 2)), ("6x6", (0, 1, 2, 3)), ("7x7", (0, 2)), ("charuco:7x5", (0,)),
+    ("circles:9x6", (0, 2)), ("circles:5x5", (0, 1, 2, 3)), ("asymmetric:4x11", (0,)), ("asymmetric:4x10", (0, 2)),
+    ("aprilgrid:4x4", (0,)),
+])  # fmt: skip
 def test_turns_that_look_alike(text, turns):
     board = Board.parse(text, "20mm")
     assert board.quarter_turns == turns
@@ -181,19 +167,15 @@ class TestKalibrFiles:
         with pytest.raises(FileError, match=r"colSpacingMeters 0\.05: squares are needed"):
             self.parse(tmp_path, checks + "0.05\n")
 
-    @pytest.mark.parametrize(
-        ("old", "new", "message"),
-        [
-            ("tagSize: 0.088", "", "tagSize must be a positive number, it is None"),
-            ("tagSize: 0.088", "tagSize: .nan", "tagSize must be a positive number"),
-            ("tagCols: 6", "tagCols: 6.5", "tagCols must be a whole number"),
-            ("tagCols: 6", "tagCols: true", "tagCols must be a whole number"),
-            ("tagSpacing: 0.3", "tagSpacing: 1.3", "gap between tags"),
-            ("'aprilgrid'", "'assymetric_aprilgrid'", "kcal reads aprilgrid, checkerboard and circlegrid"),
-            ("target_type", "type", "target_type is missing"),
-            ("target_type:", "target_type: [", "no YAML file"),
-        ],
-    )
+    @pytest.mark.parametrize(("old", "new", "message"), [
+        ("tagSize: 0.088", "", "tagSize must be a positive number, it is None"),
+        ("tagSize: 0.088", "tagSize: .nan", "tagSize must be a positive number"),
+        ("tagCols: 6", "tagCols: 6.5", "tagCols must be a whole number"),
+        ("tagCols: 6", "tagCols: true", "tagCols must be a whole number"),
+        ("tagSpacing: 0.3", "tagSpacing: 1.3", "gap between tags"),
+        ("'aprilgrid'", "'assymetric_aprilgrid'", "kcal reads aprilgrid, checkerboard and circlegrid"),
+        ("target_type", "type", "target_type is missing"), ("target_type:", "target_type: [", "no YAML file"),
+    ])  # fmt: skip
     def test_bad_files(self, tmp_path, old, new, message):
         with pytest.raises(FileError, match=message) as caught:
             self.parse(tmp_path, self.APRIL.replace(old, new))
@@ -319,20 +301,16 @@ def test_matlab_goes_down_the_columns_from_pixel_one(tmp_path: Path, world: bool
     assert seen.views[1].pixels[4] is None
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "what"),
-    [
-        ("a.vnl", "# filename x y level\na 1 2 0\n", "a has 1 corners, the board 6"),
-        ("a.vnl", "# file x y\na 1 2 0\n", "the header is"),
-        ("a.vnl", "# filename x y level\na 1 2\n", "line 2"),
-        ("a.csv", "image,u,v,size\na,1,2,3\n", "the header is"),
-        ("a.csv", "image,corner,u,v\na,6,1,2\n", "line 2: corner 6"),
-        ("a.csv", "image,corner,u,v\na,1,1,2\na,1,1,2\n", "occurs twice"),
-        ("a.csv", "image,corner,u,v\na,1,inf,2\n", "no finite numbers"),
-        ("a.csv", "image,corner,u,v\na,1,,2\n", "no view with corners"),
-        ("a.mat", "nothing", r"not a \.mat file"),
-    ],
-)
+@pytest.mark.parametrize(("name", "text", "what"), [
+    ("a.vnl", "# filename x y level\na 1 2 0\n", "a has 1 corners, the board 6"),
+    ("a.vnl", "# file x y\na 1 2 0\n", "the header is"), ("a.vnl", "# filename x y level\na 1 2\n", "line 2"),
+    ("a.csv", "image,u,v,size\na,1,2,3\n", "the header is"),
+    ("a.csv", "image,corner,u,v\na,6,1,2\n", "line 2: corner 6"),
+    ("a.csv", "image,corner,u,v\na,1,1,2\na,1,1,2\n", "occurs twice"),
+    ("a.csv", "image,corner,u,v\na,1,inf,2\n", "no finite numbers"),
+    ("a.csv", "image,corner,u,v\na,1,,2\n", "no view with corners"),
+    ("a.mat", "nothing", r"not a \.mat file"),
+])  # fmt: skip
 def test_bad_files(tmp_path: Path, name: str, text: str, what: str) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(FileError, match=what):
@@ -387,17 +365,14 @@ def test_a_detection_comes_back_from_its_file(tmp_path):
     torch.testing.assert_close(found.covariances()[0, seen], spread[seen], rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"covariance": (*SPREAD[:3], None)}, "seen corners, and only these"),
-        ({"covariance": (*SPREAD[:2], (1.0, 0.0, 1.0), SPREAD[3])}, "seen corners, and only these"),
-        ({"covariance": SPREAD[:3]}, "has 3 covariances"),
-        ({"covariance": ((0.01, 0.021, 0.04), *SPREAD[1:])}, "not positive definite"),
-        ({"covariance": ((-0.01, 0.0, -0.04), *SPREAD[1:])}, "not positive definite"),
-        ({"pixels": PIXELS[:3], "covariance": None}, "has 3 corners, the board 4"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"covariance": (*SPREAD[:3], None)}, "seen corners, and only these"),
+    ({"covariance": (*SPREAD[:2], (1.0, 0.0, 1.0), SPREAD[3])}, "seen corners, and only these"),
+    ({"covariance": SPREAD[:3]}, "has 3 covariances"),
+    ({"covariance": ((0.01, 0.021, 0.04), *SPREAD[1:])}, "not positive definite"),
+    ({"covariance": ((-0.01, 0.0, -0.04), *SPREAD[1:])}, "not positive definite"),
+    ({"pixels": PIXELS[:3], "covariance": None}, "has 3 corners, the board 4"),
+])  # fmt: skip
 def test_what_contradicts_itself_is_refused(changes, message):
     with pytest.raises(InputError, match=message):
         observed(**changes)

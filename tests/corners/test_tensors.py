@@ -73,17 +73,14 @@ def test_colors_become_gray_by_the_weights_of_opencv() -> None:
     assert as_image(0.123456 * torch.ones(2, 2)).dtype == np.uint16
 
 
-@pytest.mark.parametrize(
-    ("image", "message"),
-    [
-        (torch.full((100, 100), 128.0), "lie in 0 to 1, got 128 to 128; divide by the brightest"),
-        (torch.linspace(-2, 2, 10000).reshape(100, 100), "got -2 to 2; .*undo a normalization"),
-        (torch.full((100, 100), torch.nan), "got nan to nan"),
-        (torch.zeros(100, 100, dtype=torch.int64), r"\(3, H, W\) of uint8 or uint16.*got \(100, 100\) int64"),
-        (torch.zeros(2, 1, 100, 100), r"got \(2, 1, 100, 100\) float32"),
-        (torch.zeros(100, 100, 3), r"got \(100, 100, 3\)"),
-    ],
-)
+@pytest.mark.parametrize(("image", "message"), [
+    (torch.full((100, 100), 128.0), "lie in 0 to 1, got 128 to 128; divide by the brightest"),
+    (torch.linspace(-2, 2, 10000).reshape(100, 100), "got -2 to 2; .*undo a normalization"),
+    (torch.full((100, 100), torch.nan), "got nan to nan"),
+    (torch.zeros(100, 100, dtype=torch.int64), r"\(3, H, W\) of uint8 or uint16.*got \(100, 100\) int64"),
+    (torch.zeros(2, 1, 100, 100), r"got \(2, 1, 100, 100\) float32"),
+    (torch.zeros(100, 100, 3), r"got \(100, 100, 3\)"),
+])  # fmt: skip
 def test_other_ranges_and_shapes_are_refused(image: Tensor, message: str) -> None:
     with pytest.raises(InputError, match=message):
         detect_board(image, BOARD)

@@ -135,17 +135,11 @@ def k4a(given: np.ndarray, binned: tuple[int, int], crop: tuple[int, int]) -> np
 
 
 class TestAzureKinect:
-    @pytest.mark.parametrize(
-        ("size", "camera", "binned", "crop"),
-        [
-            (None, 0, (1024, 1024), (0, 0)),
-            ((640, 576), 0, (1024, 1024), (192, 180)),
-            ((320, 288), 0, (512, 512), (96, 90)),
-            (None, 1, (4096, 3072), (0, 0)),
-            ((1920, 1080), 1, (1920, 1440), (0, 180)),
-            ((1280, 720), 1, (1280, 960), (0, 120)),
-        ],
-    )
+    @pytest.mark.parametrize(("size", "camera", "binned", "crop"), [
+        (None, 0, (1024, 1024), (0, 0)), ((640, 576), 0, (1024, 1024), (192, 180)),
+        ((320, 288), 0, (512, 512), (96, 90)), (None, 1, (4096, 3072), (0, 0)),
+        ((1920, 1080), 1, (1920, 1440), (0, 180)), ((1280, 720), 1, (1280, 960), (0, 120)),
+    ])  # fmt: skip
     def test_modes(self, tmp_path: Path, size: Any, camera: int, binned: Any, crop: Any) -> None:
         (depth, given), (color, _) = kinect("D0", (1024, 1024)), kinect("PV0", (4096, 3072))
         path = written(tmp_path, "calibration.json", {"CalibrationInformation": {"Cameras": [depth, color]}})
@@ -203,15 +197,11 @@ def rs2(model: str, coeffs: tuple[float, ...] = RS) -> dict[str, Any]:
 
 
 class TestRealSense:
-    @pytest.mark.parametrize(
-        ("kind", "coeffs", "most"),
-        [
-            ("brown_conrady", RS, 1e-9),
-            ("kannala_brandt4", (0.05, -0.01, 0.003, -0.001, 0.0), 1e-9),
-            ("modified_brown_conrady", RS, 1e-4),
-            ("ftheta", (0.9, 0.0, 0.0, 0.0, 0.0), 1e-5),
-        ],
-    )
+    @pytest.mark.parametrize(("kind", "coeffs", "most"), [
+        ("brown_conrady", RS, 1e-9),
+        ("kannala_brandt4", (0.05, -0.01, 0.003, -0.001, 0.0), 1e-9),
+        ("modified_brown_conrady", RS, 1e-4), ("ftheta", (0.9, 0.0, 0.0, 0.0, 0.0), 1e-5),
+    ])  # fmt: skip
     @pytest.mark.parametrize("name", ["distortion.{}", "RS2_DISTORTION_{}"])
     def test_models(self, tmp_path: Path, kind: str, coeffs: Any, most: float, name: str) -> None:
         text = name.format(kind if name.islower() else kind.upper())
@@ -450,14 +440,11 @@ class TestDji:
         assert np.abs(seen(found.cameras[0]) - opencv(plain(3666.666504, 3666.666504, 2432, 1824), NONE)).max() < 1e-9
         assert any("not a calibration" in note for note in found.notes)
 
-    @pytest.mark.parametrize(
-        ("xmp", "words"),
-        [
-            (DEWARP + ' drone-dji:DewarpFlag="1"', "removed the distortion"),
-            ("", "an image without its camera"),
-            ('drone-dji:DewarpData="2018-03-13;3659,3653,1"', "DewarpData has 3 numbers"),
-        ],
-    )
+    @pytest.mark.parametrize(("xmp", "words"), [
+        (DEWARP + ' drone-dji:DewarpFlag="1"', "removed the distortion"),
+        ("", "an image without its camera"),
+        ('drone-dji:DewarpData="2018-03-13;3659,3653,1"', "DewarpData has 3 numbers"),
+    ])  # fmt: skip
     def test_refused(self, tmp_path: Path, xmp: str, words: str) -> None:
         with pytest.raises(FileError, match=words):
             import_cameras(photo(tmp_path / "a.jpg", xmp, (640, 480)))
@@ -543,19 +530,15 @@ class TestEchoed:
         assert off(seen(found.cameras[0]), opencv(K, D)) < 1e-9
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "program"),
-    [
-        ("a.json", {"views": [], "intrinsics": []}, "Meshroom"),
-        ("calib_results.txt", "#polynomial coefficients for the DIRECT mapping function.\n5\n", "OCamCalib"),
-        ("bundle.out", "# Bundle file v0.3\n1 2\n", "Bundler"),
-        ("a.nvm", "NVM_V3\n\n2\n", "VisualSFM"),
-        ("p.pto", "# hugin project file\np f2 w3000\n", "Hugin"),
-        ("a.cam", "Pix4D camera calibration file 0\n#Focal Length mm\nF 8.8\n", "Pix4D"),
-        ("camera.txt", "FOV 0.5 0.6 0.5 0.5 0.9\n640 480\ncrop\n640 480\n", "DSO"),
-        ("a.xmp", '<x:xmpmeta><rdf:Description xcr:FocalLength35mm="24"/></x:xmpmeta>', "RealityCapture"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("name", "content", "program"), [
+    ("a.json", {"views": [], "intrinsics": []}, "Meshroom"),
+    ("calib_results.txt", "#polynomial coefficients for the DIRECT mapping function.\n5\n", "OCamCalib"),
+    ("bundle.out", "# Bundle file v0.3\n1 2\n", "Bundler"), ("a.nvm", "NVM_V3\n\n2\n", "VisualSFM"),
+    ("p.pto", "# hugin project file\np f2 w3000\n", "Hugin"),
+    ("a.cam", "Pix4D camera calibration file 0\n#Focal Length mm\nF 8.8\n", "Pix4D"),
+    ("camera.txt", "FOV 0.5 0.6 0.5 0.5 0.9\n640 480\ncrop\n640 480\n", "DSO"),
+    ("a.xmp", '<x:xmpmeta><rdf:Description xcr:FocalLength35mm="24"/></x:xmpmeta>', "RealityCapture"),
+])  # fmt: skip
 def test_a_program_that_is_known_and_not_read_is_named(tmp_path: Path, name: str, content: Any, program: str) -> None:
     with pytest.raises(FileError, match=program):
         recognized(written(tmp_path, name, content))

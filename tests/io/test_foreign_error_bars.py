@@ -350,15 +350,12 @@ def test_it_is_mrcals_own(tmp_path: Path) -> None:
     assert np.abs((covariance_of(path) - wanted) / (spread[:, None] * spread)).max() < 1e-6
 
 
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"do_optimize_frames": False}, "poses of boards were held"),
-        ({"intrinsics": np.full((1, 8), 3.0)}, "are of other intrinsics than the file"),
-        ({"observations_board": np.zeros((0, 7, 7, 3))}, "without boards"),
-        ({"frames_rt_toref": np.zeros((1, 6))}, "name boards that they do not have"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "reason"), [
+    ({"do_optimize_frames": False}, "poses of boards were held"),
+    ({"intrinsics": np.full((1, 8), 3.0)}, "are of other intrinsics than the file"),
+    ({"observations_board": np.zeros((0, 7, 7, 3))}, "without boards"),
+    ({"frames_rt_toref": np.zeros((1, 6))}, "name boards that they do not have"),
+])  # fmt: skip
 def test_inputs_that_say_nothing_are_told(tmp_path: Path, changes: dict[str, Any], reason: str) -> None:
     found = import_cameras(written(tmp_path / "a.cameramodel", **changes))
     assert found.cameras[0].calibration.covariance is None

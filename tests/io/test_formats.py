@@ -135,14 +135,11 @@ class TestValues:
         assert "--fisheye" in found.notes[0]
         assert str(import_cameras(path, fisheye=True).cameras[0].model) == "fisheye4"
 
-    @pytest.mark.parametrize(
-        ("line", "model", "params"),
-        [
-            ("SIMPLE_RADIAL 640 480 500 320 240 -0.1", "opencv4", [500, 500, 319.5, 239.5, 0, -0.1, 0, 0, 0]),
-            ("OPENCV 640 480 500 510 320 240 1 2 3 4", "opencv4", [500, 510, 319.5, 239.5, 0, 1, 2, 3, 4]),
-            ("RADIAL_FISHEYE 640 480 500 320 240 1 2", "fisheye4", [500, 500, 319.5, 239.5, 0, 1, 2, 0, 0]),
-        ],
-    )
+    @pytest.mark.parametrize(("line", "model", "params"), [
+        ("SIMPLE_RADIAL 640 480 500 320 240 -0.1", "opencv4", [500, 500, 319.5, 239.5, 0, -0.1, 0, 0, 0]),
+        ("OPENCV 640 480 500 510 320 240 1 2 3 4", "opencv4", [500, 510, 319.5, 239.5, 0, 1, 2, 3, 4]),
+        ("RADIAL_FISHEYE 640 480 500 320 240 1 2", "fisheye4", [500, 500, 319.5, 239.5, 0, 1, 2, 0, 0]),
+    ])  # fmt: skip
     def test_colmap(self, tmp_path: Path, line: str, model: str, params: list[float]) -> None:
         camera = import_cameras(write(tmp_path, "cameras.txt", f"# comment\n7 {line}\n")).cameras[0]
         assert (str(camera.model), camera.params.tolist()) == (model, params)
@@ -200,27 +197,22 @@ class TestValues:
 
 
 class TestRefusals:
-    @pytest.mark.parametrize(
-        ("name", "text", "what"),
-        [
-            ("a.yaml", ROS.replace("BASE", "0").replace("plumb_bob", "double_sphere"), "distortion_model"),
-            ("a.yaml", ROS.replace("BASE", "0").replace("[-0.2, 0.05,", "["), "3 numbers; 4 or 5 or"),
-            ("a.yaml", KALIBR.replace("pinhole", "omni"), "omni"),
-            ("a.yaml", ROS.replace("BASE", "0").replace("data: [400, 0, 320", "data: [0, 0, 320"), "no focal length"),
-            ("a.yaml", ROS.replace("BASE", "0").replace("0, 400, 240", "0, 0, 240"), "no focal length"),
-            ("a.yaml", KALIBR.replace("[0, -1, 0, -0.1]", "[2, -1, 0, -0.1]"), "no rotation matrix"),
-            ("a.cameramodel", MRCAL.replace("OPENCV5", "CAHVOR"), "LENSMODEL_CAHVOR"),
-            ("a.cameramodel", MRCAL.replace("640, 480", "640.5, 480"), "positive whole numbers"),
-            ("a.cameramodel", "__import__('os').system('true')", "malformed node"),
-            ("cameras.txt", "1 FOV3 640 480 500 500 320 240 1", "camera model FOV3"),
-            ("cameras.txt", "1 PINHOLE 640 480 500 500 320", "line 1"),
-            ("cameras.txt", "1 PINHOLE 640 480 nan 500 320 240", "finite"),
-            ("a.json", "{}", "no camera that kcal knows"),
-            ("a.yaml", "hello: 1", "name its format"),
-            ("a.yaml", "%YAML:1.0\n---\nother: 1\n", "no camera"),
-            ("a.mat", "no mat", "not a .mat file"),
-        ],
-    )
+    @pytest.mark.parametrize(("name", "text", "what"), [
+        ("a.yaml", ROS.replace("BASE", "0").replace("plumb_bob", "double_sphere"), "distortion_model"),
+        ("a.yaml", ROS.replace("BASE", "0").replace("[-0.2, 0.05,", "["), "3 numbers; 4 or 5 or"),
+        ("a.yaml", KALIBR.replace("pinhole", "omni"), "omni"),
+        ("a.yaml", ROS.replace("BASE", "0").replace("data: [400, 0, 320", "data: [0, 0, 320"), "no focal length"),
+        ("a.yaml", ROS.replace("BASE", "0").replace("0, 400, 240", "0, 0, 240"), "no focal length"),
+        ("a.yaml", KALIBR.replace("[0, -1, 0, -0.1]", "[2, -1, 0, -0.1]"), "no rotation matrix"),
+        ("a.cameramodel", MRCAL.replace("OPENCV5", "CAHVOR"), "LENSMODEL_CAHVOR"),
+        ("a.cameramodel", MRCAL.replace("640, 480", "640.5, 480"), "positive whole numbers"),
+        ("a.cameramodel", "__import__('os').system('true')", "malformed node"),
+        ("cameras.txt", "1 FOV3 640 480 500 500 320 240 1", "camera model FOV3"),
+        ("cameras.txt", "1 PINHOLE 640 480 500 500 320", "line 1"),
+        ("cameras.txt", "1 PINHOLE 640 480 nan 500 320 240", "finite"),
+        ("a.json", "{}", "no camera that kcal knows"), ("a.yaml", "hello: 1", "name its format"),
+        ("a.yaml", "%YAML:1.0\n---\nother: 1\n", "no camera"), ("a.mat", "no mat", "not a .mat file"),
+    ])  # fmt: skip
     def test_one_error_that_names_the_file(self, tmp_path: Path, name: str, text: str, what: str) -> None:
         with pytest.raises(FileError, match=what) as error:
             import_cameras(write(tmp_path, name, text))

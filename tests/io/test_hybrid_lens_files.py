@@ -60,22 +60,18 @@ def test_covariance_and_rig(tmp_path: Path) -> None:
     assert (back.left.fingerprint, back.right.fingerprint) == (rig.left.fingerprint, rig.right.fingerprint)
 
 
-@pytest.mark.parametrize(
-    ("path_in_file", "value", "message"),
-    [
-        (["model", "hybrid", "modes", "radial"], 7, "z7.1 is missing"),
-        (["model", "hybrid", "modes", "other"], 2, "z3.3 is unknown"),
-        (["model", "hybrid", "modes", "radial"], 99, "radial must be a whole number from 0 to 40"),
-        (["model", "hybrid", "modes", "coma"], 3, "modes.coma.*Extra"),
-        (["model", "hybrid", "radius"], 0.0, "radius of its disc must be positive"),
-        (["model", "hybrid", "shape"], 99.0, "within ±10"),
-        (["model", "hybrid", "kind"], "spline", "hybrid.kind.*Extra"),
-        (["model", "tangential"], True, "terms of its own"),
-        (["model", "hybrid"], None, "is unknown"),
-        (["coefficients", "z9+9"], 0.0, r"z9.9 is unknown; the lens model needs exactly shape, pupil1"),
-        (["coefficients", "z5+1"], float("nan"), "finite"),
-    ],
-)
+@pytest.mark.parametrize(("path_in_file", "value", "message"), [
+    (["model", "hybrid", "modes", "radial"], 7, "z7.1 is missing"),
+    (["model", "hybrid", "modes", "other"], 2, "z3.3 is unknown"),
+    (["model", "hybrid", "modes", "radial"], 99, "radial must be a whole number from 0 to 40"),
+    (["model", "hybrid", "modes", "coma"], 3, "modes.coma.*Extra"),
+    (["model", "hybrid", "radius"], 0.0, "radius of its disc must be positive"),
+    (["model", "hybrid", "shape"], 99.0, "within ±10"),
+    (["model", "hybrid", "kind"], "spline", "hybrid.kind.*Extra"),
+    (["model", "tangential"], True, "terms of its own"), (["model", "hybrid"], None, "is unknown"),
+    (["coefficients", "z9+9"], 0.0, r"z9.9 is unknown; the lens model needs exactly shape, pupil1"),
+    (["coefficients", "z5+1"], float("nan"), "finite"),
+])  # fmt: skip
 def test_wrong_field(tmp_path: Path, path_in_file: list[str], value: Any, message: str) -> None:
     content = camera_to_file(hybrid_camera("webcam", modes=FEW_MODES)).dump()
     assert_refused(load_camera, tmp_path, content, path_in_file, value, message)

@@ -31,13 +31,10 @@ def test_red_is_first_and_transparency_last() -> None:
     assert stored[0, 0].tolist() == [30, 20, 10, 40]
 
 
-@pytest.mark.parametrize(
-    "image",
-    [
-        np.zeros((4, 6), np.float32), np.zeros((4, 6, 2), np.uint8), np.zeros((0, 6), np.uint8), np.zeros(6, np.uint8),
-        np.zeros((4, 6, 5), np.uint8), np.zeros((2, 4, 6, 3), np.uint8),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("image", [
+    np.zeros((4, 6), np.float32), np.zeros((4, 6, 2), np.uint8), np.zeros((0, 6), np.uint8), np.zeros(6, np.uint8),
+    np.zeros((4, 6, 5), np.uint8), np.zeros((2, 4, 6, 3), np.uint8),
+])  # fmt: skip
 def test_what_no_png_can_hold_is_refused(image: np.ndarray) -> None:
     with pytest.raises(InputError, match="an image"):
         encode_png(image)

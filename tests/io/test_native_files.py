@@ -136,17 +136,13 @@ class TestCamera:
         )
         assert torch.equal(shuffled.expand(camera.names), matrix)
 
-    @pytest.mark.parametrize(
-        ("names", "matrix", "message"),
-        [
-            (("fx", "fy"), ((1.0, 0.0),), "2 rows of 2"),
-            (("fx", "fy"), ((1.0, 0.5), (0.4, 1.0)), "symmetric"),
-            (("fx", "fy"), ((1.0, 2.0), (2.0, 1.0)), "negative eigenvalue"),
-            (("fx", "fx"), ((1.0, 0.0), (0.0, 1.0)), "twice"),
-            (("fx", "k9x"), ((1.0, 0.0), (0.0, 1.0)), "k9x is unknown"),
-            (("fx",), ((math.inf,),), "finite"),
-        ],
-    )
+    @pytest.mark.parametrize(("names", "matrix", "message"), [
+        (("fx", "fy"), ((1.0, 0.0),), "2 rows of 2"), (("fx", "fy"), ((1.0, 0.5), (0.4, 1.0)), "symmetric"),
+        (("fx", "fy"), ((1.0, 2.0), (2.0, 1.0)), "negative eigenvalue"),
+        (("fx", "fx"), ((1.0, 0.0), (0.0, 1.0)), "twice"),
+        (("fx", "k9x"), ((1.0, 0.0), (0.0, 1.0)), "k9x is unknown"),
+        (("fx",), ((math.inf,),), "finite"),
+    ])  # fmt: skip
     def test_no_covariance(self, tmp_path: Path, camera: Camera, names: Any, matrix: Any, message: str) -> None:
         stated = {"names": names, "matrix": matrix}
         assert_refused(CameraFile.load, tmp_path, camera_to_file(camera).dump(), ["covariance"], stated, message)
@@ -198,35 +194,25 @@ class TestCamera:
         path.write_text(json.dumps(content))
         assert torch.equal(load_camera(path).params, camera.params)
 
-    @pytest.mark.parametrize(
-        ("path_in_file", "value", "message"),
-        [
-            (["coefficients", "k99"], 0.0, "k99 is unknown"),
-            (["coefficients", "k1"], math.nan, "finite"),
-            (["coefficients", "k1"], math.inf, "finite"),
-            (["coefficients", "k1"], "fast", "number"),
-            (["model", "numerator"], 4, "missing|unknown"),
-            (["model", "numerator"], 99, "0 to 7"),
-            (["model", "mirror"], True, "Extra"),
-            (["intrinsics", "fx"], 0.0, "greater than 0"),
-            (["intrinsics", "cx"], math.nan, "finite"),
-            (["image_size"], [640, 0], "greater than 0"),
-            (["image_size"], [640], "required"),
-            (["image_size"], [10**400, 480], "has 401 digits"),
-            (["image_size"], [10**300, 480], "at most 500 megapixels"),
-            (["image_size"], [30_000, 30_000], "30000x30000 pixels; .* at most 500 megapixels"),
-            (["image_size"], ["640", "480"], "image_size.0: Input should be a valid integer"),
-            (["intrinsics", "fy"], True, "intrinsics.fy: Input should be a valid number"),
-            (["intrinsics", "fy"], "1600", "intrinsics.fy: Input should be a valid number"),
-            (["calibration", "board_deviation"], [[0.0, 0.0, math.nan]], "finite"),
-            (["standard_deviations"], {"fx": 1.0}, "fy is missing"),
-            (["standard_deviations", "fx"], -1.0, "greater than or equal to 0"),
-            (["calibration", "views"], 3, "per_view_rms has 2"),
-            (["calibration", "created"], "2026-01-01T00:00:00", "timezone"),
-            (["version"], 3, "version 3"),
-            (["color"], "red", "Extra"),
-        ],
-    )
+    @pytest.mark.parametrize(("path_in_file", "value", "message"), [
+        (["coefficients", "k99"], 0.0, "k99 is unknown"), (["coefficients", "k1"], math.nan, "finite"),
+        (["coefficients", "k1"], math.inf, "finite"), (["coefficients", "k1"], "fast", "number"),
+        (["model", "numerator"], 4, "missing|unknown"), (["model", "numerator"], 99, "0 to 7"),
+        (["model", "mirror"], True, "Extra"), (["intrinsics", "fx"], 0.0, "greater than 0"),
+        (["intrinsics", "cx"], math.nan, "finite"), (["image_size"], [640, 0], "greater than 0"),
+        (["image_size"], [640], "required"), (["image_size"], [10**400, 480], "has 401 digits"),
+        (["image_size"], [10**300, 480], "at most 500 megapixels"),
+        (["image_size"], [30_000, 30_000], "30000x30000 pixels; .* at most 500 megapixels"),
+        (["image_size"], ["640", "480"], "image_size.0: Input should be a valid integer"),
+        (["intrinsics", "fy"], True, "intrinsics.fy: Input should be a valid number"),
+        (["intrinsics", "fy"], "1600", "intrinsics.fy: Input should be a valid number"),
+        (["calibration", "board_deviation"], [[0.0, 0.0, math.nan]], "finite"),
+        (["standard_deviations"], {"fx": 1.0}, "fy is missing"),
+        (["standard_deviations", "fx"], -1.0, "greater than or equal to 0"),
+        (["calibration", "views"], 3, "per_view_rms has 2"),
+        (["calibration", "created"], "2026-01-01T00:00:00", "timezone"),
+        (["version"], 3, "version 3"), (["color"], "red", "Extra"),
+    ])  # fmt: skip
     def test_wrong_field(
         self, tmp_path: Path, camera: Camera, path_in_file: list[str], value: Any, message: str
     ) -> None:
@@ -282,39 +268,30 @@ class TestRig:
         with pytest.raises(FileError, match=r"camera\.json: this is a kcal camera file; a kcal rig file is needed"):
             load_rig(camera_path)
 
-    @pytest.mark.parametrize(
-        ("path_in_file", "value", "message"),
-        [
-            (["poses", 1, "rotation", 0, 0], 0.5, "no rotation"),
-            (["poses", 1, "rotation"], [[1, 0, 0], [0, 1, 0], [0, 0, -1]], "no rotation"),
-            (["poses", 1, "rotation", 2, 2], math.nan, "finite"),
-            (["poses", 1, "rotation"], [[1, 0], [0, 1]], "required"),
-            (["poses", 1, "translation"], [1.0, 2.0], "required"),
-            (["names", 1], "left", "unlike names"),
-            (["cameras", 0, "coefficients", "k1"], math.inf, "finite"),
-            (["cameras", 1, "coefficients", "k9"], 0.0, "k9 is unknown"),
-            (["calibration", "pairs"], 5, "per_pair_rms has 1"),
-        ],
-    )
+    @pytest.mark.parametrize(("path_in_file", "value", "message"), [
+        (["poses", 1, "rotation", 0, 0], 0.5, "no rotation"),
+        (["poses", 1, "rotation"], [[1, 0, 0], [0, 1, 0], [0, 0, -1]], "no rotation"),
+        (["poses", 1, "rotation", 2, 2], math.nan, "finite"), (["poses", 1, "rotation"], [[1, 0], [0, 1]], "required"),
+        (["poses", 1, "translation"], [1.0, 2.0], "required"), (["names", 1], "left", "unlike names"),
+        (["cameras", 0, "coefficients", "k1"], math.inf, "finite"),
+        (["cameras", 1, "coefficients", "k9"], 0.0, "k9 is unknown"),
+        (["calibration", "pairs"], 5, "per_pair_rms has 1"),
+    ])  # fmt: skip
     def test_wrong_field(self, tmp_path: Path, rig: Rig, path_in_file: list[Any], value: Any, message: str) -> None:
         rig = copy.deepcopy(rig)
         rig.calibration = rig_calibration()
         content = rig_to_file(rig).dump()
         assert_refused(load_rig, tmp_path, content, path_in_file, value, message)
 
-    @pytest.mark.parametrize(
-        ("path_in_file", "value", "message"),
-        [
-            (["right_from_left", "rotation", 0, 0], 0.5, "no rotation"),
-            (["right_from_left", "rotation"], [[1, 0], [0, 1]], "required"),
-            (["right_from_left", "translation"], [1.0, 2.0], "required"),
-            (["right_from_left", "translation", 0], -10.2, "baseline_m"),
-            (["right", "coefficients", "k9"], 0.0, "k9 is unknown"),
-            (["calibration", "frame"], "right camera", "left camera"),
-            (["calibration", "pairs"], 5, "per_pair_rms has"),
-            (["covariance"], [[1.0]], "covariance"),
-        ],
-    )
+    @pytest.mark.parametrize(("path_in_file", "value", "message"), [
+        (["right_from_left", "rotation", 0, 0], 0.5, "no rotation"),
+        (["right_from_left", "rotation"], [[1, 0], [0, 1]], "required"),
+        (["right_from_left", "translation"], [1.0, 2.0], "required"),
+        (["right_from_left", "translation", 0], -10.2, "baseline_m"),
+        (["right", "coefficients", "k9"], 0.0, "k9 is unknown"),
+        (["calibration", "frame"], "right camera", "left camera"), (["calibration", "pairs"], 5, "per_pair_rms has"),
+        (["covariance"], [[1.0]], "covariance"),
+    ])  # fmt: skip
     def test_wrong_field_of_a_file_of_1_0(
         self, tmp_path: Path, path_in_file: list[Any], value: Any, message: str
     ) -> None:

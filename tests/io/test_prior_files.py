@@ -128,16 +128,12 @@ def order(*names: str) -> dict[str, Any]:
     return {"model": "opencv4", "parameters": [[name, 1.0, 0.0] for name in names]}
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"kcal": order("fx", "fx"), "mean": [1.0, 2.0]}, "twice"),
-        ({"kcal": order(*map(str, range(65))), "mean": [0.0] * 65}, "too many"),
-        ({"kcal": order("fx", "fy", "cx", "cy", "k9"), "mean": [800.0, 800.0, 320.0, 240.0, 0.1]}, "no parameter k9"),
-        ({"mean": [800.0]}, "mean"),
-        ({"sqrt_information": [[1.0]]}, "sqrt_information"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"kcal": order("fx", "fx"), "mean": [1.0, 2.0]}, "twice"),
+    ({"kcal": order(*map(str, range(65))), "mean": [0.0] * 65}, "too many"),
+    ({"kcal": order("fx", "fy", "cx", "cy", "k9"), "mean": [800.0, 800.0, 320.0, 240.0, 0.1]}, "no parameter k9"),
+    ({"mean": [800.0]}, "mean"), ({"sqrt_information": [[1.0]]}, "sqrt_information"),
+])  # fmt: skip
 def test_a_prior_that_fits_nothing_is_refused(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(FileError, match=message):
         import_cameras(changed(tmp_path, **changes))
@@ -218,20 +214,16 @@ def test_read_back(camera: Camera, tmp_path: Path) -> None:
     assert second.read_bytes() == first.read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"unknowns": [["fx"], ["fx"]]}, "twice"),
-        ({"sigma": [1.0]}, "unknowns"),
-        ({"triangle": {"shape": [1], "float64": "AAAA"}}, "whole doubles"),
-        ({"triangle": {"shape": [54], "float64": "!"}}, "base64"),
-        ({"unknowns": [[name] for name in ("fx", "cx", "cy", "k1", "k2", "p1", "k9")]}, "k9"),
-        # Their squares overflow, or those of their inverses.
-        ({"sigma": [5e-324, *[None] * 8]}, r"camera\.json.*below 1e-100"),
-        ({"triangle": Packed.of(1e200 * torch.ones(54).double()).model_dump()}, r"camera\.json.*beyond 1e\+100"),
-        ({"triangle": Packed.of(1e-200 * torch.ones(54).double()).model_dump()}, r"camera\.json.*less than 1e-100"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"unknowns": [["fx"], ["fx"]]}, "twice"), ({"sigma": [1.0]}, "unknowns"),
+    ({"triangle": {"shape": [1], "float64": "AAAA"}}, "whole doubles"),
+    ({"triangle": {"shape": [54], "float64": "!"}}, "base64"),
+    ({"unknowns": [[name] for name in ("fx", "cx", "cy", "k1", "k2", "p1", "k9")]}, "k9"),
+    # Their squares overflow, or those of their inverses.
+    ({"sigma": [5e-324, *[None] * 8]}, r"camera\.json.*below 1e-100"),
+    ({"triangle": Packed.of(1e200 * torch.ones(54).double()).model_dump()}, r"camera\.json.*beyond 1e\+100"),
+    ({"triangle": Packed.of(1e-200 * torch.ones(54).double()).model_dump()}, r"camera\.json.*less than 1e-100"),
+])  # fmt: skip
 def test_damaged(camera: Camera, tmp_path: Path, change: dict[str, object], message: str) -> None:
     """Files that contradict themselves are refused, and say where."""
     path = save_camera(camera, tmp_path / "camera.json")
@@ -276,18 +268,13 @@ def test_file_is_lossless(tmp_path: Path) -> None:
         torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        ({"kcal": "rig"}, "this is a kcal rig file"),
-        ({"version": 2}, "version 2 of the board format"),
-        ({"amplitudes": [0.0] * 27, "half": [[0.0] * 27] * 28}, "28 amplitudes"),
-        ({"half": [[0.0] * 28] * 27}, "28 x 28"),
-        ({"half": [[0.0] * 27] * 28}, "as many columns"),
-        ({"amplitudes": ["x"] * 28}, "amplitudes"),
-        ({"board": {"columns": 1, "rows": 6, "square": 0.025}}, "columns"),
-    ],
-)
+@pytest.mark.parametrize(("change", "complaint"), [
+    ({"kcal": "rig"}, "this is a kcal rig file"), ({"version": 2}, "version 2 of the board format"),
+    ({"amplitudes": [0.0] * 27, "half": [[0.0] * 27] * 28}, "28 amplitudes"),
+    ({"half": [[0.0] * 28] * 27}, "28 x 28"), ({"half": [[0.0] * 27] * 28}, "as many columns"),
+    ({"amplitudes": ["x"] * 28}, "amplitudes"),
+    ({"board": {"columns": 1, "rows": 6, "square": 0.025}}, "columns"),
+])  # fmt: skip
 def test_bad_files_are_refused(tmp_path: Path, change: dict[str, Any], complaint: str) -> None:
     path = save_measured_board(awkward_board(), tmp_path / "x.board.json")
     path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | change), encoding="utf-8")

@@ -128,58 +128,25 @@ LENS_KEYS = ("distortion_coefficients", "dist_coeffs", "dist_coeff", "distortion
 READ: dict[str, tuple[str, Any, Pixels]] = {
     **{f"YAML {key}": (f"{key}.yml", opencv("camera_matrix", key), plain()) for key in LENS_KEYS},
     **{f"XML {key}": ("a.xml", XML.format(key, " ".join(map(str, D)), key), plain()) for key in ("dist_coeffs", "D")},
-    **{
-        f"JSON {keys}": ("a.json", SIZE | dict(zip(keys.split(), (M, [D]), strict=True)), plain())
-        for keys in (
-            "camera_matrix dist_coeffs",
-            "mtx dist",
-            "K d",
-            "intrinsics distortion",
-            "cameraMatrix distCoeffs",
-            "intrinsic_matrix distortion_coefficients",
-        )
-    },
-    **{
-        f"TOML {key}": ("a.toml", TOML.format(M, key, D), plain())
-        for key in ("distortions", "dist_coeffs", "distortion_coeffs")
-    },
+    **{f"JSON {keys}": ("a.json", SIZE | dict(zip(keys.split(), (M, [D]), strict=True)), plain())
+       for keys in ("camera_matrix dist_coeffs", "mtx dist", "K d", "intrinsics distortion", "cameraMatrix distCoeffs",
+                    "intrinsic_matrix distortion_coefficients")},
+    **{f"TOML {key}": ("a.toml", TOML.format(M, key, D), plain())
+       for key in ("distortions", "dist_coeffs", "distortion_coeffs")},
     "nested": ("a.json", {"camera": {"K": M, "D": D, "width": 640, "height": 480}}, plain()),
-    "named numbers": (
-        "a.json",
-        SIZE
-        | dict(zip(("fx", "fy", "cx", "cy"), C, strict=True))
-        | dict(zip(("k1", "k2", "p1", "p2", "k3"), D, strict=True)),
-        plain(),
-    ),
-    "ORB-SLAM": (
-        "a.yaml",
-        ORB("PinHole", *["Camera"] * 4) + "Camera.k1: -0.2\nCamera.k2: 0.05\nCamera.p1: 0.001\n"
-        "Camera.p2: -0.002\nCamera.k3: 0.01\n",
-        plain(),
-    ),
-    "ORB-SLAM fisheye": (
-        "a.yaml",
-        ORB("KannalaBrandt8", *["Camera1"] * 4) + "Camera1.k1: 0.05\nCamera1.k2: -0.01\n"
-        "Camera1.k3: 0.002\nCamera1.k4: 0.001\n",
-        fisheye(),
-    ),
-    "VINS": (
-        "a.yaml",
-        "%YAML:1.0\n---\nmodel_type: KANNALA_BRANDT\ncamera_name: camera\nimage_width: 640\n"
+    "named numbers": ("a.json", SIZE | dict(zip(("fx", "fy", "cx", "cy"), C, strict=True))
+        | dict(zip(("k1", "k2", "p1", "p2", "k3"), D, strict=True)), plain()),
+    "ORB-SLAM": ("a.yaml", ORB("PinHole", *["Camera"] * 4) + "Camera.k1: -0.2\nCamera.k2: 0.05\nCamera.p1: 0.001\n"
+        "Camera.p2: -0.002\nCamera.k3: 0.01\n", plain()),
+    "ORB-SLAM fisheye": ("a.yaml", ORB("KannalaBrandt8", *["Camera1"] * 4) + "Camera1.k1: 0.05\nCamera1.k2: -0.01\n"
+        "Camera1.k3: 0.002\nCamera1.k4: 0.001\n", fisheye()),
+    "VINS": ("a.yaml", "%YAML:1.0\n---\nmodel_type: KANNALA_BRANDT\ncamera_name: camera\nimage_width: 640\n"
         "image_height: 480\nprojection_parameters:\n   k2: 0.05\n   k3: -0.01\n   k4: 0.002\n   k5: 0.001\n"
-        "   mu: 500\n   mv: 505\n   u0: 330\n   v0: 236\n",
-        fisheye(),
-    ),
-    "two in a list": (
-        "a.json",
-        {"cameras": [{"name": "a", "type": "hd", "resolution": [640, 480], "K": M, "distCoef": D}]},
-        plain(),
-    ),
-    "INI": (
-        "a.ini",
-        "; mine\n[camera]\nfx: 500\nfy: 505\ncx: 330\ncy: 236\nwidth: 640\nheight: 480\nk1: -0.2\n",
-        plain(d=[-0.2, 0, 0, 0]),
-    ),
+        "   mu: 500\n   mv: 505\n   u0: 330\n   v0: 236\n", fisheye()),
+    "two in a list": ("a.json",
+        {"cameras": [{"name": "a", "type": "hd", "resolution": [640, 480], "K": M, "distCoef": D}]}, plain()),
+    "INI": ("a.ini", "; mine\n[camera]\nfx: 500\nfy: 505\ncx: 330\ncy: 236\nwidth: 640\nheight: 480\nk1: -0.2\n",
+        plain(d=[-0.2, 0, 0, 0])),
     "np.savez": ("a.npz", {"mtx": M, "dist": [D], "image_size": [640, 480], "rvecs": np.zeros((3, 3, 1))}, plain()),
     "tight": ("a.yml", opencv("K", "D").replace("data: [", "data:[").replace("rows: ", "rows:"), plain()),
     "gzip": ("a.yml.gz", gzip.compress(opencv("K", "D").encode()), plain()),
@@ -193,68 +160,37 @@ READ: dict[str, tuple[str, Any, Pixels]] = {
     "ROS camera_model plumb_bob": ("ost.yaml", ros("camera_model: plumb_bob"), plain()),
     "ROS rational 8": ("ost.yaml", ros("distortion_model: rational_polynomial", RATIONAL), plain(d=RATIONAL)),
     "ROS rational 5": ("ost.yaml", ros("distortion_model: rational_polynomial"), plain()),
-    "ROS rational 14": (
-        "ost.yaml",
-        ros("distortion_model: rational_polynomial", [*RATIONAL, *[1e-3] * 4, 0, 0]),
-        plain(d=[*RATIONAL, *[1e-3] * 4, 0, 0]),
-    ),
+    "ROS rational 14": ("ost.yaml", ros("distortion_model: rational_polynomial", [*RATIONAL, *[1e-3] * 4, 0, 0]),
+        plain(d=[*RATIONAL, *[1e-3] * 4, 0, 0])),
     # image_geometry gives all of them to OpenCV, whatever the name.
     "ROS plumb_bob 8": ("ost.yaml", ros(lens=RATIONAL), plain(d=RATIONAL)),
     "ROS none": ("ost.yaml", ros("distortion_model: none", [0.0] * 5), plain(d=np.zeros(5))),
     "ROS none, empty": ("ost.yaml", ros("distortion_model: ''", []), plain(d=np.zeros(5))),
     # sensor_msgs/CameraInfo: K is of the full image, of which these are delivered.
     "ROS binning": ("ost.yaml", ros(more="binning_x: 2\nbinning_y: 2\n"), plain(BINNED)),
-    "ROS binned K": (
-        "ost.yaml",
-        ros(more="binning_x: 4\nbinning_y: 4\n").replace("640", "2640").replace("480", "1888"),
-        plain(),
-    ),
+    "ROS binned K": ("ost.yaml", ros(more="binning_x: 4\nbinning_y: 4\n").replace("640", "2640").replace("480", "1888"),
+        plain()),
     "ROS window": ("ost.yaml", ros(more="roi: {x_offset: 20, y_offset: 10, width: 600, height: 460}\n"), plain(CUT)),
-    "nerfstudio k4": (
-        "t.json",
-        nerf(camera_model="OPENCV", k1=-0.1, k2=0.02, k3=0.003, k4=-0.004),
-        half(radial4(-0.1, 0.02, 0.003, -0.004)),
-    ),
-    "nerfstudio distortion_params": (
-        "t.json",
-        nerf(distortion_params=[-0.1, 0.02, 0.003, 0, 0.001, 0.002]),
-        half(plain(d=[-0.1, 0.02, 0.001, 0.002, 0.003])),
-    ),
-    "nerfstudio of a frame": (
-        "t.json",
-        nerf(frames=[NERF_FRAME]),
-        half(plain(d=[-0.1, 0.02, 0.001, 0.002])),
-    ),
+    "nerfstudio k4": ("t.json", nerf(camera_model="OPENCV", k1=-0.1, k2=0.02, k3=0.003, k4=-0.004),
+        half(radial4(-0.1, 0.02, 0.003, -0.004))),
+    "nerfstudio distortion_params": ("t.json", nerf(distortion_params=[-0.1, 0.02, 0.003, 0, 0.001, 0.002]),
+        half(plain(d=[-0.1, 0.02, 0.001, 0.002, 0.003]))),
+    "nerfstudio of a frame": ("t.json", nerf(frames=[NERF_FRAME]), half(plain(d=[-0.1, 0.02, 0.001, 0.002]))),
     "nerfstudio SIMPLE_RADIAL": ("t.json", nerf(camera_model="SIMPLE_RADIAL", k1=-0.1), half(plain(d=[-0.1, 0, 0, 0]))),
     "nerfstudio RADIAL": ("t.json", nerf(camera_model="RADIAL", k1=-0.1, k2=0.02), half(plain(d=[-0.1, 0.02, 0, 0]))),
     "nerfstudio PINHOLE with k1": ("t.json", nerf(camera_model="PINHOLE", k1=-0.1), half(plain(d=[-0.1, 0, 0, 0]))),
-    "nerfstudio angle": (
-        "t.json",
-        {"camera_angle_x": 2 * math.atan(0.64), "w": 640, "h": 480, "frames": []},
-        half(plain([[500, 0, 320], [0, 500, 240], [0, 0, 1]], np.zeros(5))),
-    ),
-    "instant-ngp": (
-        "t.json",
-        nerf(k1=0.05, k2=-0.01, is_fisheye=True, aabb_scale=4),
-        half(fisheye(d=[0.05, -0.01, 0, 0])),
-    ),
+    "nerfstudio angle": ("t.json", {"camera_angle_x": 2 * math.atan(0.64), "w": 640, "h": 480, "frames": []},
+        half(plain([[500, 0, 320], [0, 500, 240], [0, 0, 1]], np.zeros(5)))),
+    "instant-ngp": ("t.json", nerf(k1=0.05, k2=-0.01, is_fisheye=True, aabb_scale=4),
+        half(fisheye(d=[0.05, -0.01, 0, 0]))),
     "Kalibr radtan": ("c.yaml", kalibr("pinhole", "radtan", [], D[:4]), plain(d=D[:4])),
     "Kalibr equidistant": ("c.yaml", kalibr("pinhole", "equidistant", [], F), fisheye()),
     "Kalibr of OpenVINS": ("c.yaml", "%YAML:1.0\n\n" + kalibr("pinhole", "radtan", [], D[:4]), plain(d=D[:4])),
     "Bouguet": ("Calib_Results.mat", BOUGUET, plain(SKEWED, D)),
-    "MATLAB JSON": (
-        "m.json",
-        {
-            "K": [[500, 0, 331], [0, 505, 237], [0, 0, 1]],
-            "ImageSize": [480, 640],
-            "RadialDistortion": [D[0], D[1], D[4]],
-            "TangentialDistortion": D[2:4],
-            "NumRadialDistortionCoefficients": 3,
-            "EstimateSkew": False,
-        },
-        plain(),
-    ),
-}
+    "MATLAB JSON": ("m.json", {"K": [[500, 0, 331], [0, 505, 237], [0, 0, 1]], "ImageSize": [480, 640],
+        "RadialDistortion": [D[0], D[1], D[4]], "TangentialDistortion": D[2:4], "NumRadialDistortionCoefficients": 3,
+        "EstimateSkew": False}, plain()),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", READ)
@@ -279,41 +215,23 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
     "no center": ("a.json", SIZE | {"fx": 500, "fy": 505, "k1": -0.1}, "cx and cy of the principal point are missing"),
     "none, but bent": ("a.yaml", ros("distortion_model: none"), "none, but there are coefficients"),
     "four of K": ("a.json", SIZE | {"K": C, "D": D}, "K has 4 numbers"),
-    "twice": (
-        "a.json",
-        SIZE | {"projection_parameters": {"fx": 1.0}, "calib_parameters": {"fx": 2.0}},
-        "fx is there twice",
-    ),
+    "twice": ("a.json", SIZE | {"projection_parameters": {"fx": 1.0}, "calib_parameters": {"fx": 2.0}},
+        "fx is there twice"),
     "misspelled": ("a.yml", opencv("K", "distrotion_coeffs"), "distrotion_coeffs .5 numbers. may describe the lens"),
     "by shape": ("a.json", SIZE | {"K": M, "verzeichnung": D}, "verzeichnung .5 numbers. may describe the lens"),
-    "another matrix": (
-        "a.json",
-        SIZE | {"K": M, "D": D, "kamera": (K + 1).tolist()},
-        "kamera .9 numbers. may describe",
-    ),
-    "two matrices": (
-        "a.json",
-        SIZE | {"K": M, "D": D, "mtx": (2 * K - np.diag([0, 0, 1.0])).tolist()},
-        "K and mtx .*differ",
-    ),
+    "another matrix": ("a.json", SIZE | {"K": M, "D": D, "kamera": (K + 1).tolist()},
+        "kamera .9 numbers. may describe"),
+    "two matrices": ("a.json", SIZE | {"K": M, "D": D, "mtx": (2 * K - np.diag([0, 0, 1.0])).tolist()},
+        "K and mtx .*differ"),
     "a stray skew": ("a.toml", TOML.format(M, "distortions", D) + "alpha = 0.4\n", "alpha .0.4. may describe"),
-    "inside": (
-        "a.json",
-        SIZE | {"K": M, "D": D, "extra": {"tangential_coeffs": [0.1, 0.2]}},
-        "extra.tangential_coeffs",
-    ),
+    "inside": ("a.json", SIZE | {"K": M, "D": D, "extra": {"tangential_coeffs": [0.1, 0.2]}},
+        "extra.tangential_coeffs"),
     "other lens": ("a.yaml", ros("distortion_model: double_sphere", F), "distortion_model double_sphere: kcal reads"),
-    "contradiction": (
-        "a.yml",
-        opencv("K", "D", F, more="distortion_model: plumb_bob\nfisheye_model: 1\n"),
-        "contradict",
-    ),
+    "contradiction": ("a.yml", opencv("K", "D", F, more="distortion_model: plumb_bob\nfisheye_model: 1\n"),
+        "contradict"),
     "none with coefficients": ("c.yaml", kalibr("pinhole", "none", [], [0.1]), "distortion_coeffs has 1 numbers"),
-    "Kalibr key": (
-        "c.yaml",
-        kalibr("pinhole", "radtan", [], D[:4], "  dist_k3: 0.1\n"),
-        "cam0.dist_k3 .0.1. may describe",
-    ),
+    "Kalibr key": ("c.yaml", kalibr("pinhole", "radtan", [], D[:4], "  dist_k3: 0.1\n"),
+        "cam0.dist_k3 .0.1. may describe"),
     "nerfstudio key": ("t.json", nerf(ftheta_p1=0.1, distortion=[0.1, 0.2]), "distortion .2 numbers. may describe"),
     "nerfstudio model": ("t.json", nerf(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR: kcal reads"),
     "fisheye with p1": ("t.json", nerf(is_fisheye=True, p1=0.1), "p1: a fisheye has no such term"),
@@ -322,7 +240,7 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
     "COLMAP's panorama": ("cameras.txt", PANORAMA, "camera model EQUIRECTANGULAR"),
     "cut gzip": ("a.yml.gz", gzip.compress(opencv("K", "D").encode())[:-20], "cut short"),
     "no size": ("a.json", {"K": M, "D": D}, "image size is not in the file"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -340,35 +258,21 @@ def test_blank_lines_and_comments_take_no_time(tmp_path: Path, text: str, form: 
         import_cameras(written(tmp_path, "a.txt", text), format=form)
 
 
-@pytest.mark.parametrize(
-    "more",
-    [
-        {"rms": 0.3, "board_size": [9, 6], "calibration_time": "today", "flags": 4, "image_points": [[1, 2]] * 5},
-        {"per_view_errors": [0.1] * 6, "rvecs": [[0.1, 0.2, 0.3]] * 3, "new_camera_matrix": M, "camera_name": "x"},
-        {
-            "R": np.eye(3).tolist(),
-            "Q": np.eye(4).tolist(),
-            "R1": np.eye(3).tolist(),
-            "P1": [[1.0, 0, 0, 5]] * 3,
-            "E": M,
-        },
-        {"skew": 0, "xi2": 0.0, "distortion_model": "plumb_bob", "serial": 123456},
-    ],
-)
+@pytest.mark.parametrize("more", [
+    {"rms": 0.3, "board_size": [9, 6], "calibration_time": "today", "flags": 4, "image_points": [[1, 2]] * 5},
+    {"per_view_errors": [0.1] * 6, "rvecs": [[0.1, 0.2, 0.3]] * 3, "new_camera_matrix": M, "camera_name": "x"},
+    {"R": np.eye(3).tolist(), "Q": np.eye(4).tolist(), "R1": np.eye(3).tolist(), "P1": [[1.0, 0, 0, 5]] * 3, "E": M},
+    {"skew": 0, "xi2": 0.0, "distortion_model": "plumb_bob", "serial": 123456},
+])  # fmt: skip
 def test_metadata_is_no_lens(tmp_path: Path, more: dict[str, Any]) -> None:
     found = import_cameras(written(tmp_path, "a.json", SIZE | {"K": M, "D": D} | more))
     assert found.cameras[0].params.tolist() == [*C, 0.0, *D]
     assert found.notes == ()
 
 
-@pytest.mark.parametrize(
-    ("size", "center", "words"),
-    [
-        ((640, 480), (960, 540), "outside"),
-        ((1280, 720), (320, 240), "far from the middle"),
-        ((640, 480), (330, 236), ""),
-    ],
-)
+@pytest.mark.parametrize(("size", "center", "words"), [
+    ((640, 480), (960, 540), "outside"), ((1280, 720), (320, 240), "far from the middle"), ((640, 480), (330, 236), ""),
+])  # fmt: skip
 def test_centers_of_other_images_are_said(
     tmp_path: Path, size: tuple[int, int], center: tuple[int, int], words: str
 ) -> None:
@@ -462,30 +366,22 @@ FIELD = Path(os.environ.get("KCAL_DATA", ".")) / "field"
 WIDE = np.array([[0.9, 0.4, 1.0], [-0.5, 0.3, 1], [0.1, -0.2, 1]])
 TUTORIAL = plain([[535.9, 0, 342.3], [0, 535.9, 235.6], [0, 0, 1]], [-0.266, -0.0386, 0.00178, -0.00028, 0.2384])
 IN_FIELD: dict[str, Pixels] = {
-    "dropdist/b.json": TUTORIAL,
-    "yaml/list.yml": TUTORIAL,
-    "yaml/tight.yml": TUTORIAL,
+    "dropdist/b.json": TUTORIAL, "yaml/list.yml": TUTORIAL, "yaml/tight.yml": TUTORIAL,
     "ros/ost.yaml": fisheye([[404.0, -1, 871], [0, 404.7, 597.4], [0, 0, 1]], [0.18, -0.03, 0.0004, -0.0007]),
     "nerf/ingp.json": half(fisheye([[500.0, 0, 640], [0, 500, 360], [0, 0, 1]], [0.05, -0.01, 0, 0])),
-    "binning/info.yaml": plain(
-        [[299.54396, 0, 254.14465], [0, 300.14093, 183.94307], [0, 0, 1]], [-0.097715, 0.08086, -0.003701, 0.001999, 0]
-    ),
+    "binning/info.yaml": plain([[299.54396, 0, 254.14465], [0, 300.14093, 183.94307], [0, 0, 1]],
+        [-0.097715, 0.08086, -0.003701, 0.001999, 0]),
     "binning/roi.yaml": plain([[1000.0, 0, 960], [0, 1000, 540], [0, 0, 1]], [-0.1, 0.08, 0, 0, 0]),
-    "imports/bouguet.mat": plain(
-        [[657.46, 0, 303.13], [0, 657.94, 242.56], [0, 0, 1]], [-0.256, 0.127, -2e-4, 3e-5, 0]
-    ),
-    "imports/ost.txt": plain(
-        [[438.783367, 0, 305.593336], [0, 437.302876, 243.738352], [0, 0, 1]],
-        [-0.361976, 0.11051, 0.001014, 0.000505, 0],
-    ),
-    "imports/kalibr_openvins.yaml": plain(
-        [[458.654, 0, 367.215], [0, 457.296, 248.375], [0, 0, 1]], [-0.28, 0.07, 2e-4, 2e-5]
-    ),
+    "imports/bouguet.mat": plain([[657.46, 0, 303.13], [0, 657.94, 242.56], [0, 0, 1]],
+        [-0.256, 0.127, -2e-4, 3e-5, 0]),
+    "imports/ost.txt": plain([[438.783367, 0, 305.593336], [0, 437.302876, 243.738352], [0, 0, 1]],
+        [-0.361976, 0.11051, 0.001014, 0.000505, 0]),
+    "imports/kalibr_openvins.yaml": plain([[458.654, 0, 367.215], [0, 457.296, 248.375], [0, 0, 1]],
+        [-0.28, 0.07, 2e-4, 2e-5]),
     "imports/colmap_mixed.txt": half(plain([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], np.zeros(5))),
-    "imports/kalibr_mixed.yaml": plain(
-        [[458.654, 0, 367.215], [0, 457.296, 248.375], [0, 0, 1]], [-0.28, 0.07, 2e-4, 2e-5]
-    ),
-}
+    "imports/kalibr_mixed.yaml": plain([[458.654, 0, 367.215], [0, 457.296, 248.375], [0, 0, 1]],
+        [-0.28, 0.07, 2e-4, 2e-5]),
+}  # fmt: skip
 
 
 @pytest.mark.skipif(not FIELD.is_dir(), reason="KCAL_DATA does not name the data")

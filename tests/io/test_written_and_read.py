@@ -16,16 +16,11 @@ from kcal.lens.pose import Pose
 
 LENS = (-0.21, 0.052, 1.1e-3, -2.3e-3, 0.013, 0.021, -0.032, 0.0041, 5e-4, -6e-4, 7e-4, -8e-4)
 SUFFIXES = {
-    "opencv": (".yml", ".xml", ".json"),
-    "colmap": (".txt", ".bin"),
-    "mrcal": (".cameramodel",),
-    "matlab": (".mat",),
+    "opencv": (".yml", ".xml", ".json"), "colmap": (".txt", ".bin"), "mrcal": (".cameramodel",), "matlab": (".mat",),
     "toml": (".toml",),
     **dict.fromkeys(("nerfstudio", "opensfm", "basalt", "multical", "gtsam", "ceres"), (".json",)),
-    "numpy": (".npz",),
-    "bag": (".bag", ".mcap", ".db3"),
-    **dict.fromkeys(("ros", "kalibr"), (".yaml",)),
-}
+    "numpy": (".npz",), "bag": (".bag", ".mcap", ".db3"), **dict.fromkeys(("ros", "kalibr"), (".yaml",)),
+}  # fmt: skip
 
 
 def camera(model: str, number: int = 0, skew: float = 0.0) -> Camera:

@@ -31,14 +31,11 @@ def make_rig() -> Rig:
 
 
 CASTS: dict[str, Callable[[nn.Module], nn.Module]] = {
-    "half": lambda m: m.half(),
-    "bfloat16": lambda m: m.bfloat16(),
-    "float": lambda m: m.float(),
-    "double": lambda m: m.double(),
-    "to float16": lambda m: m.to(torch.float16),
+    "half": lambda m: m.half(), "bfloat16": lambda m: m.bfloat16(), "float": lambda m: m.float(),
+    "double": lambda m: m.double(), "to float16": lambda m: m.to(torch.float16),
     "to cpu float32": lambda m: m.to("cpu", torch.float32),
     "inside a network": lambda m: nn.Sequential(nn.Linear(2, 2), m).half()[1],
-}
+}  # fmt: skip
 
 
 class TestPrecision:
@@ -187,16 +184,12 @@ class TestBatches:
 
 
 class TestRefusals:
-    @pytest.mark.parametrize(
-        ("vector", "message"),
-        [
-            (torch.ones(9), r"shape \(\.\.\., 10\) is needed, got \(9,\)"),
-            (torch.ones(10, dtype=torch.int64), "floating point"),
-            (torch.full((10,), float("nan")), "10 of 10 values are not finite"),
-            (torch.zeros(10), "focal lengths must be positive"),
-            (-torch.ones(10), "focal lengths must be positive"),
-        ],
-    )
+    @pytest.mark.parametrize(("vector", "message"), [
+        (torch.ones(9), r"shape \(\.\.\., 10\) is needed, got \(9,\)"),
+        (torch.ones(10, dtype=torch.int64), "floating point"),
+        (torch.full((10,), float("nan")), "10 of 10 values are not finite"),
+        (torch.zeros(10), "focal lengths must be positive"), (-torch.ones(10), "focal lengths must be positive"),
+    ])  # fmt: skip
     def test_camera(self, vector: torch.Tensor, message: str) -> None:
         with pytest.raises(InputError, match=message):
             Camera(vector, size=(4, 3), model="opencv5")
@@ -209,19 +202,14 @@ class TestRefusals:
         with pytest.raises(InputError, match=r"6 coefficients given, opencv5 has 5; choose model=.opencv8."):
             Camera.build(focal=(1, 1), center=(0, 0), size=(4, 3), coefficients=[0.0] * 6)
 
-    @pytest.mark.parametrize(
-        ("rotation", "translation", "message"),
-        [
-            (torch.eye(3)[:2], torch.ones(3), "shapes"),
-            (torch.eye(3), torch.ones(1, 3), "shapes"),
-            (torch.eye(4), torch.ones(3), "shape"),
-            (2 * torch.eye(3), torch.ones(3), "not a rotation"),
-            (torch.diag(torch.tensor([1.0, 1.0, -1.0])), torch.ones(3), "not a rotation"),
-            (torch.full((3, 3), float("nan")), torch.ones(3), "not finite"),
-            (torch.eye(3), torch.full((3,), float("inf")), "not finite"),
-            (torch.eye(3, dtype=torch.int64), torch.ones(3), "floating point"),
-        ],
-    )
+    @pytest.mark.parametrize(("rotation", "translation", "message"), [
+        (torch.eye(3)[:2], torch.ones(3), "shapes"), (torch.eye(3), torch.ones(1, 3), "shapes"),
+        (torch.eye(4), torch.ones(3), "shape"), (2 * torch.eye(3), torch.ones(3), "not a rotation"),
+        (torch.diag(torch.tensor([1.0, 1.0, -1.0])), torch.ones(3), "not a rotation"),
+        (torch.full((3, 3), float("nan")), torch.ones(3), "not finite"),
+        (torch.eye(3), torch.full((3,), float("inf")), "not finite"),
+        (torch.eye(3, dtype=torch.int64), torch.ones(3), "floating point"),
+    ])  # fmt: skip
     def test_rig(self, rotation: torch.Tensor, translation: torch.Tensor, message: str) -> None:
         with pytest.raises(InputError, match=message):
             Rig.pair(make_camera(), make_camera(), rotation, translation)

@@ -52,25 +52,19 @@ def test_a_rig_of_stereo_calibrate() -> None:
     assert rig.right_from_left_translation.shape == (3,)
 
 
-@pytest.mark.parametrize(
-    ("matrix", "lens", "size", "message"),
-    [
-        (K.T, None, SIZE, "no camera matrix.*give its transpose"),
-        (K[:2], None, SIZE, r"\(3, 3\) is needed, got \(2, 3\)"),
-        (K.ravel(), None, SIZE, r"\(3, 3\) is needed, got \(9,\)"),
-        (K + np.array([[0, 2, 0]] + [[0] * 3] * 2), None, SIZE, "skew of 2 px, which cv2.projectPoints ignores"),
-        (K, D[:6], SIZE, r"4 or 5 or 8 or 12 or 14 coefficients are needed, got shape \(6,\)"),
-        (K, np.zeros((2, 2)), SIZE, r"got shape \(2, 2\)"),
-        (K, np.zeros(20), SIZE, r"Camera.build\(..., model='ext20'\)"),
-        (K * np.nan, None, SIZE, "no camera matrix"),
-        (np.diag([-1.0, 1, 1]), None, SIZE, "focal lengths must be positive"),
-        (K, None, (480, 640, 3), r"image.shape\[1::-1\]"),
-        (K, None, (640.5, 480), "whole"),
-        (K, None, None, r"\(width, height\)"),
-        ("K", None, SIZE, "numbers is needed, got str"),
-        (K, np.array([None] * 5), SIZE, "D: .* of object"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("matrix", "lens", "size", "message"), [
+    (K.T, None, SIZE, "no camera matrix.*give its transpose"), (K[:2], None, SIZE, r"\(3, 3\) is needed, got \(2, 3\)"),
+    (K.ravel(), None, SIZE, r"\(3, 3\) is needed, got \(9,\)"),
+    (K + np.array([[0, 2, 0]] + [[0] * 3] * 2), None, SIZE, "skew of 2 px, which cv2.projectPoints ignores"),
+    (K, D[:6], SIZE, r"4 or 5 or 8 or 12 or 14 coefficients are needed, got shape \(6,\)"),
+    (K, np.zeros((2, 2)), SIZE, r"got shape \(2, 2\)"),
+    (K, np.zeros(20), SIZE, r"Camera.build\(..., model='ext20'\)"),
+    (K * np.nan, None, SIZE, "no camera matrix"),
+    (np.diag([-1.0, 1, 1]), None, SIZE, "focal lengths must be positive"),
+    (K, None, (480, 640, 3), r"image.shape\[1::-1\]"), (K, None, (640.5, 480), "whole"),
+    (K, None, None, r"\(width, height\)"), ("K", None, SIZE, "numbers is needed, got str"),
+    (K, np.array([None] * 5), SIZE, "D: .* of object"),
+])  # fmt: skip
 def test_what_is_refused(matrix: Any, lens: Any, size: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Camera.from_opencv(matrix, lens, size)
@@ -89,15 +83,12 @@ def test_what_opencv_does_not_have() -> None:
         Camera.from_opencv(K, D[:5], SIZE, fisheye=True)
 
 
-@pytest.mark.parametrize(
-    ("matrix", "size", "message"),
-    [
-        (K, (480, 640), r"size is \(width, height\)"),
-        (K, (1280, 960), "far from the middle .* numbers of another size"),
-        (K, (320, 240), "outside an image .* numbers of another size"),
-        (np.array([[1.2, 0, 0.5], [0, 1.2, 0.5], [0, 0, 1]]), SIZE, "must be in pixels"),
-    ],
-)
+@pytest.mark.parametrize(("matrix", "size", "message"), [
+    (K, (480, 640), r"size is \(width, height\)"),
+    (K, (1280, 960), "far from the middle .* numbers of another size"),
+    (K, (320, 240), "outside an image .* numbers of another size"),
+    (np.array([[1.2, 0, 0.5], [0, 1.2, 0.5], [0, 0, 1]]), SIZE, "must be in pixels"),
+])  # fmt: skip
 def test_what_is_doubted(matrix: Any, size: tuple[int, int], message: str) -> None:
     with pytest.warns(KcalWarning, match=message) as caught:
         Camera.from_opencv(matrix, None, size)
@@ -122,14 +113,11 @@ def make_rig(*shift: float, turn: tuple[float, float, float] = (0, 0, 0)) -> Rig
     return Rig.pair(camera, camera, cv2.Rodrigues(np.array(turn, dtype=float))[0], np.array(shift)[:, None])
 
 
-@pytest.mark.parametrize(
-    ("shift", "message"),
-    [
-        ((-10_000.0, 0, 0), "baseline is 10.0 km; the translation must be in meters"),
-        ((-1e-4, 0, 0), "baseline is 0.100 mm; the translation must be in meters"),
-        ((10.0, 0.5, 1.0), "the right camera stands 10.0 m to the left of the left one"),
-    ],
-)
+@pytest.mark.parametrize(("shift", "message"), [
+    ((-10_000.0, 0, 0), "baseline is 10.0 km; the translation must be in meters"),
+    ((-1e-4, 0, 0), "baseline is 0.100 mm; the translation must be in meters"),
+    ((10.0, 0.5, 1.0), "the right camera stands 10.0 m to the left of the left one"),
+])  # fmt: skip
 def test_rigs_that_are_doubted(shift: tuple[float, ...], message: str) -> None:
     with pytest.warns(KcalWarning, match=message) as caught:
         rig = make_rig(*shift)

@@ -42,16 +42,11 @@ def directions(angles: Tensor, count: int = 9) -> Tensor:
 
 
 class TestBaseMap:
-    @pytest.mark.parametrize(
-        ("shape", "radius"),
-        [
-            (1.0, torch.tan),
-            (0.25, lambda theta: 2 * torch.tan(theta / 2)),
-            (0.0, lambda theta: theta),
-            (-0.5, lambda theta: torch.tanh(theta * math.sqrt(0.5)) / math.sqrt(0.5)),
-            (1e-3, lambda theta: torch.tan(theta * math.sqrt(1e-3)) / math.sqrt(1e-3)),
-        ],
-    )
+    @pytest.mark.parametrize(("shape", "radius"), [
+        (1.0, torch.tan), (0.25, lambda theta: 2 * torch.tan(theta / 2)), (0.0, lambda theta: theta),
+        (-0.5, lambda theta: torch.tanh(theta * math.sqrt(0.5)) / math.sqrt(0.5)),
+        (1e-3, lambda theta: torch.tan(theta * math.sqrt(1e-3)) / math.sqrt(1e-3)),
+    ])  # fmt: skip
     def test_radius_by_angle(self, shape, radius) -> None:
         theta = torch.cat([torch.tensor([0.0, 1e-9]), torch.linspace(0.01, 1.3, 40)]).double()
         rays = directions(theta, 1)
@@ -337,16 +332,10 @@ class TestModel:
         torch.testing.assert_close(there.cpu(), rays, rtol=0, atol=1e-12)
         torch.testing.assert_close(moved.project(there)[0].cpu(), camera.project(rays)[0], rtol=0, atol=1e-9)
 
-    @pytest.mark.parametrize(
-        ("shape", "radius", "message"),
-        [
-            (1.0, 0.0, "radius"),
-            (1.0, math.nan, "radius"),
-            (1.0, math.inf, "radius"),
-            (11.0, 1.0, "shape"),
-            (math.nan, 1.0, "shape"),
-        ],
-    )
+    @pytest.mark.parametrize(("shape", "radius", "message"), [
+        (1.0, 0.0, "radius"), (1.0, math.nan, "radius"), (1.0, math.inf, "radius"), (11.0, 1.0, "shape"),
+        (math.nan, 1.0, "shape"),
+    ])  # fmt: skip
     def test_impossible_constants(self, shape: float, radius: float, message: str) -> None:
         with pytest.raises(InputError, match=message):
             HybridForm(shape=shape, radius=radius)

@@ -202,16 +202,12 @@ class TestModule:
             ["_extra_state", *(f"{which}.{name}" for which in ("camera", "new_camera") for name in LITTLE.state_dict())]
         )
 
-    @pytest.mark.parametrize(
-        ("image", "message"),
-        [
-            (torch.rand(1, 160, 120), r"shape \(..., C, 120, 160\) is needed, got \(1, 160, 120\)"),
-            (torch.rand(120, 160), r"got \(120, 160\)"),
-            (torch.zeros(1, 120, 160, dtype=torch.int64), "int64"),
-            (np.zeros((1, 120, 160)), "ndarray"),
-            (torch.rand(1, 120, 160, device="meta"), "image is on meta"),
-        ],
-    )
+    @pytest.mark.parametrize(("image", "message"), [
+        (torch.rand(1, 160, 120), r"shape \(..., C, 120, 160\) is needed, got \(1, 160, 120\)"),
+        (torch.rand(120, 160), r"got \(120, 160\)"), (torch.zeros(1, 120, 160, dtype=torch.int64), "int64"),
+        (np.zeros((1, 120, 160)), "ndarray"),
+        (torch.rand(1, 120, 160, device="meta"), "image is on meta"),
+    ])  # fmt: skip
     def test_refused(self, image: Tensor, message: str) -> None:
         with pytest.raises(InputError, match=message):
             Undistort(LITTLE)(image)
@@ -356,19 +352,13 @@ def _with(camera: Camera, values: torch.Tensor) -> Camera:
     return other
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: ImageTransform.crop(FULL, 1900, 0, (640, 480)), "does not lie inside"),
-        (lambda: ImageTransform.resize(FULL, (0, 640)), "must be positive"),
-        (
-            lambda: camera_of("opencv5", 0.3).transformed(ImageTransform.resize((640, 480), (320, 240))),
-            "the camera has",
-        ),
-        (lambda: TRANSFORMS["crop"].then(TRANSFORMS["resize"]), "the second begins with"),
-        (lambda: TRANSFORMS["crop"].to_full(torch.ones(3, 2, dtype=torch.int64)), "floating point"),
-    ],
-)
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda: ImageTransform.crop(FULL, 1900, 0, (640, 480)), "does not lie inside"),
+    (lambda: ImageTransform.resize(FULL, (0, 640)), "must be positive"),
+    (lambda: camera_of("opencv5", 0.3).transformed(ImageTransform.resize((640, 480), (320, 240))), "the camera has"),
+    (lambda: TRANSFORMS["crop"].then(TRANSFORMS["resize"]), "the second begins with"),
+    (lambda: TRANSFORMS["crop"].to_full(torch.ones(3, 2, dtype=torch.int64)), "floating point"),
+])  # fmt: skip
 def test_what_cannot_be(make: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         make()  # type: ignore[operator]

@@ -73,17 +73,14 @@ def test_pinholes_in_batches_and_with_skew(count: int) -> None:
     assert torch.equal(again.params, values if count > 1 else values[0])
 
 
-@pytest.mark.parametrize(
-    ("camera", "message"),
-    [
-        (camera_with("opencv12", [-0.2, 0.05, 0, 0, 0, 0, 0, 0, 1e-3]), r"no camera of kornia holds .*refit_camera"),
-        (Camera(torch.cat([torch.tensor([800.0, 800, 320, 240, 0]), strong(HYBRID)]), size=(640, 480), model=HYBRID),
-         "holds this hybrid lens"),
-        (camera_with("opencv5", [-0.2], skew=1.0), "lens with skew"),
-        (Camera(torch.tensor([[8e2, 8e2, 320, 240, 0, -0.1, 0, 0, 0]]).repeat(2, 1), size=(640, 480), model="opencv4"),
-         "one by one"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("camera", "message"), [
+    (camera_with("opencv12", [-0.2, 0.05, 0, 0, 0, 0, 0, 0, 1e-3]), r"no camera of kornia holds .*refit_camera"),
+    (Camera(torch.cat([torch.tensor([800.0, 800, 320, 240, 0]), strong(HYBRID)]), size=(640, 480), model=HYBRID),
+        "holds this hybrid lens"),
+    (camera_with("opencv5", [-0.2], skew=1.0), "lens with skew"),
+    (Camera(torch.tensor([[8e2, 8e2, 320, 240, 0, -0.1, 0, 0, 0]]).repeat(2, 1), size=(640, 480), model="opencv4"),
+        "one by one"),
+])  # fmt: skip
 def test_what_kornia_does_not_hold_is_refused(camera: Camera, message: str) -> None:
     with pytest.raises(InputError, match=message):
         camera.to_kornia()

@@ -82,29 +82,22 @@ class TestTerms:
 
     X, Y, S = 0.5, 0.25, 0.3125
 
-    @pytest.mark.parametrize(
-        ("name", "expected"),
-        [
-            *((f"k{i}", lambda x, y, s, j=j: (x * (1 + s**j / 8), y * (1 + s**j / 8))) for i, j in
-              ((1, 1), (2, 2), (3, 3), (7, 4), (8, 5), (11, 6), (13, 7))),
-            *((f"k{i}", lambda x, y, s, j=j: (x / (1 + s**j / 8), y / (1 + s**j / 8))) for i, j in
-              ((4, 1), (5, 2), (6, 3), (9, 4), (10, 5), (12, 6), (14, 7))),
-            ("p1", lambda x, y, s: (x + x * y / 4, y + (s + 2 * y * y) / 8)),
-            ("p2", lambda x, y, s: (x + (s + 2 * x * x) / 8, y + x * y / 4)),
-            *((f"s{i}", lambda x, y, s, j=j: (x + s**j / 8, y)) for i, j in ((1, 1), (2, 2), (5, 3), (7, 4))),
-            *((f"s{i}", lambda x, y, s, j=j: (x, y + s**j / 8)) for i, j in ((3, 1), (4, 2), (6, 3), (8, 4))),
-            # A tilt about x: w = cos τ - sin τ y; x cos τ / w, y / w.
-            ("tau_x", lambda x, y, s: (
-                x * math.cos(0.125) / (math.cos(0.125) - math.sin(0.125) * y),
-                y / (math.cos(0.125) - math.sin(0.125) * y),
-            )),
-            # A tilt about y: w = cos τ + sin τ x; x / w, y cos τ / w.
-            ("tau_y", lambda x, y, s: (
-                x / (math.cos(0.125) + math.sin(0.125) * x),
-                y * math.cos(0.125) / (math.cos(0.125) + math.sin(0.125) * x),
-            )),
-        ],
-    )  # fmt: skip
+    @pytest.mark.parametrize(("name", "expected"), [
+        *((f"k{i}", lambda x, y, s, j=j: (x * (1 + s**j / 8), y * (1 + s**j / 8))) for i,
+            j in ((1, 1), (2, 2), (3, 3), (7, 4), (8, 5), (11, 6), (13, 7))),
+        *((f"k{i}", lambda x, y, s, j=j: (x / (1 + s**j / 8), y / (1 + s**j / 8))) for i,
+            j in ((4, 1), (5, 2), (6, 3), (9, 4), (10, 5), (12, 6), (14, 7))),
+        ("p1", lambda x, y, s: (x + x * y / 4, y + (s + 2 * y * y) / 8)),
+        ("p2", lambda x, y, s: (x + (s + 2 * x * x) / 8, y + x * y / 4)),
+        *((f"s{i}", lambda x, y, s, j=j: (x + s**j / 8, y)) for i, j in ((1, 1), (2, 2), (5, 3), (7, 4))),
+        *((f"s{i}", lambda x, y, s, j=j: (x, y + s**j / 8)) for i, j in ((3, 1), (4, 2), (6, 3), (8, 4))),
+        # A tilt about x: w = cos τ - sin τ y; x cos τ / w, y / w.
+        ("tau_x", lambda x, y, s: (x * math.cos(0.125) / (math.cos(0.125) - math.sin(0.125) * y),
+            y / (math.cos(0.125) - math.sin(0.125) * y))),
+        # A tilt about y: w = cos τ + sin τ x; x / w, y cos τ / w.
+        ("tau_y", lambda x, y, s: (x / (math.cos(0.125) + math.sin(0.125) * x), y * math.cos(0.125) / (math.cos(0.125)
+            + math.sin(0.125) * x))),
+    ])  # fmt: skip
     def test_alone(self, name: str, expected: Callable[[float, float, float], tuple[float, float]]) -> None:
         model = LensModel(numerator=7, denominator=7, tangential=True, prism=4, tilt=True)
         coefficients = torch.zeros(model.size, dtype=torch.float64)

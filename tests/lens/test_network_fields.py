@@ -305,16 +305,10 @@ class _Other(nn.Module):
         return self.layer(places[:, :1])
 
 
-@pytest.mark.parametrize(
-    ("kind", "complaint"),
-    [
-        ("others", "each place alone"),
-        ("one", r"correction \(N, 2\)"),
-        ("nan", "finite"),
-        ("drop", "drop-out"),
-        ("wrong", "it fails"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "complaint"), [
+    ("others", "each place alone"), ("one", r"correction \(N, 2\)"), ("nan", "finite"), ("drop", "drop-out"),
+    ("wrong", "it fails"),
+])  # fmt: skip
 def test_networks_that_are_no_fields(kind: str, complaint: str) -> None:
     with pytest.raises(InputError, match=complaint):
         NetworkModes.of(_Other(kind))

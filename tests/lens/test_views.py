@@ -94,16 +94,12 @@ class TestViews:
         assert abs(pupil_shift(camera, 2.0) / shift - 0.5) < 0.01
         assert pupil_shift(LEFT, 1.0) == 0.0
 
-    @pytest.mark.parametrize(
-        "make",
-        [
-            lambda: pinhole_view(175.0, (64, 48)),
-            lambda: Cylinder(focal=10.0, center=(0.0, 0.0), size=(100, 10)),
-            lambda: cylinder_view(LEFT, 400.0),
-            lambda: Undistort(LEFT, at=0.0),
-            lambda: Undistort(LEFT, rotation=torch.eye(2)),
-        ],
-    )
+    @pytest.mark.parametrize("make", [
+        lambda: pinhole_view(175.0, (64, 48)),
+        lambda: Cylinder(focal=10.0, center=(0.0, 0.0), size=(100, 10)),
+        lambda: cylinder_view(LEFT, 400.0), lambda: Undistort(LEFT, at=0.0),
+        lambda: Undistort(LEFT, rotation=torch.eye(2)),
+    ])  # fmt: skip
     def test_refused(self, make: object) -> None:
         with pytest.raises(InputError):
             make()  # type: ignore[operator]
@@ -112,14 +108,10 @@ class TestViews:
 class TestStereo:
     @pytest.mark.parametrize("options", [{}, {"alpha": 1.0}, {"field_of_view": 50.0}], ids=str)
     @pytest.mark.parametrize("rolled", [0.0, 180.0])
-    @pytest.mark.parametrize(
-        ("place", "axis", "sign"),
-        [
-            ((2.0, 0.1, 0.05), 0, 1), ((-2.0, 0.1, 0.05), 0, -1), ((0.1, 2.0, 0.05), 1, 1), ((0.1, -2.0, 0.05), 1, -1),
-            ((2.0, -1.6, 0.0), 0, 1),
-        ],
-        ids=["right", "left", "below", "above", "diagonal"],
-    )  # fmt: skip
+    @pytest.mark.parametrize(("place", "axis", "sign"), [
+        ((2.0, 0.1, 0.05), 0, 1), ((-2.0, 0.1, 0.05), 0, -1), ((0.1, 2.0, 0.05), 1, 1), ((0.1, -2.0, 0.05), 1, -1),
+        ((2.0, -1.6, 0.0), 0, 1),
+    ], ids=["right", "left", "below", "above", "diagonal"])  # fmt: skip
     def test_rows_and_disparity(
         self, place: tuple[float, float, float], axis: int, sign: int, rolled: float, options: dict[str, float]
     ) -> None:

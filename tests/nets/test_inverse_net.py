@@ -39,29 +39,18 @@ _HD: dict[str, Any] = {"focal": (1600, 1605), "center": (957, 541), "size": (192
 CAMERAS: dict[str, Callable[[], Camera]] = {
     "opencv5": lambda: Camera.build(**_HD, coefficients=_BARREL[:5], model="opencv5"),
     "opencv14": lambda: Camera.build(**_HD, coefficients=_BARREL, model="opencv14"),
-    "ext20": lambda: Camera.build(
-        **_HD, coefficients=[*_BARREL, 0.004, -0.002, 0.003, 0.001, 1e-4, -1e-4], model="ext20"
-    ),
+    "ext20": lambda: Camera.build(**_HD, coefficients=[*_BARREL, 0.004, -0.002, 0.003, 0.001, 1e-4, -1e-4],
+        model="ext20"),
     # Some 150 degrees, as fitted to a real lens.
-    "wide": lambda: Camera.build(
-        focal=(2073.8, 2077.7),
-        center=(3003.5, 2001.4),
-        size=(6016, 4016),
-        coefficients=_WIDE,
-        model="opencv14",
-    ),
+    "wide": lambda: Camera.build(focal=(2073.8, 2077.7), center=(3003.5, 2001.4), size=(6016, 4016), coefficients=_WIDE,
+        model="opencv14"),
     # Corners beyond the fold (kornia issue 3273).
-    "folding": lambda: Camera.build(
-        focal=(1917.36, 1917.36),
-        center=(1920, 1080),
-        size=(3840, 2160),
-        coefficients=[-0.2535, 0.0924, -0.0006, 0.0007, -0.0191],
-    ),
-    "fisheye": lambda: Camera.build(
-        focal=(400, 402), center=(637, 481), size=(1280, 960), coefficients=[0.02, -0.01, 0.003], model="fisheye4"
-    ),
+    "folding": lambda: Camera.build(focal=(1917.36, 1917.36), center=(1920, 1080), size=(3840, 2160),
+        coefficients=[-0.2535, 0.0924, -0.0006, 0.0007, -0.0191]),
+    "fisheye": lambda: Camera.build(focal=(400, 402), center=(637, 481), size=(1280, 960),
+        coefficients=[0.02, -0.01, 0.003], model="fisheye4"),
     "hybrid": lambda: hybrid_camera("webcam"),
-}
+}  # fmt: skip
 
 
 @functools.cache

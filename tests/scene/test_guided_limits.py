@@ -22,21 +22,11 @@ def seen(pixels: list[list[float]]) -> Keypoints:
     return Keypoints(torch.tensor(pixels).double(), torch.eye(len(pixels), 128))
 
 
-@pytest.mark.parametrize(
-    ("off", "found"),
-    [
-        # In pixels from the middle, f 500: at infinity; nearer by a third of a radian at most; behind, by the band.
-        ((0.0, 0.0), True),
-        ((-160.0, 0.0), True),
-        ((-180.0, 0.0), False),
-        ((2.9, 0.0), True),
-        ((3.1, 0.0), False),
-        ((0.0, 2.9), True),
-        ((0.0, -2.9), True),
-        ((0.0, 3.1), False),
-        ((-50.0, -3.1), False),
-    ],
-)
+@pytest.mark.parametrize(("off", "found"), [
+    # In pixels from the middle, f 500: at infinity; nearer by a third of a radian at most; behind, by the band.
+    ((0.0, 0.0), True), ((-160.0, 0.0), True), ((-180.0, 0.0), False), ((2.9, 0.0), True), ((3.1, 0.0), False),
+    ((0.0, 2.9), True), ((0.0, -2.9), True), ((0.0, 3.1), False), ((-50.0, -3.1), False),
+])  # fmt: skip
 def test_near_the_line_and_not_too_near(off: tuple[float, float], found: bool) -> None:
     left, right = seen([[240.0, 160.0]]), seen([[240.0 + off[0], 160.0 + off[1]]])
     assert guided_matches(LEVEL, (left, right)).tolist() == ([[0, 0]] if found else [])

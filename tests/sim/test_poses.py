@@ -102,18 +102,10 @@ def test_impossible_views_are_refused():
         sample_pair_poses(apart, BOARD, 3, seeded(0), distance=(1.0, 2.0))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"count": 0}, "count"),
-        ({"count": 10**6}, "count"),
-        ({"fill": (0.9, 0.4)}, "fill"),
-        ({"fill": (0.0, 0.4)}, "fill"),
-        ({"fill": (0.2, float("nan"))}, "fill"),
-        ({"board": BoardSize(1, 5, 0.1)}, "board"),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({"count": 0}, "count"), ({"count": 10**6}, "count"), ({"fill": (0.9, 0.4)}, "fill"),
+    ({"fill": (0.0, 0.4)}, "fill"), ({"fill": (0.2, float("nan"))}, "fill"), ({"board": BoardSize(1, 5, 0.1)}, "board"),
+], ids=str)  # fmt: skip
 def test_bad_arguments(arguments, message):
     count, board = arguments.pop("count", 3), arguments.pop("board", BOARD)
     with pytest.raises(InputError, match=message):

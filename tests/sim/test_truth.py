@@ -134,15 +134,10 @@ def test_the_pupil_wanders_by_its_share() -> None:
     assert pupil_wander(none) < 1e-12
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"focal": 0.0}, "positive"),
-        ({"wander": 2.0}, "from 0 to 1"),
-        ({"focal": 800.0}, "no chief ray"),
-        ({"size": (0, 3)}, "positive"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({"focal": 0.0}, "positive"), ({"wander": 2.0}, "from 0 to 1"), ({"focal": 800.0}, "no chief ray"),
+    ({"size": (0, 3)}, "positive"),
+])  # fmt: skip
 def test_bad_arguments(arguments: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         TruthLens(WEBCAM, **arguments)
@@ -194,16 +189,11 @@ def test_refraction_is_snells_law(angle: float, turn: float, ratio: float) -> No
         torch.testing.assert_close(part, ratio * math.sin(angle) * across, atol=1e-12, rtol=0)
 
 
-@pytest.mark.parametrize(
-    "surface",
-    [
-        Surface(radius=1.3, thickness=0.1),
-        Asphere(radius=-2.0, thickness=0.1, conic=0.7),
-        Surface(radius=math.inf, thickness=0.1),
-        Asphere(radius=1.67, thickness=0.1, conic=-1.0, even=(-0.1, 0.014, -1.5e-3)),
-    ],
-    ids=["sphere", "ellipsoid", "plane", "asphere"],
-)
+@pytest.mark.parametrize("surface", [
+    Surface(radius=1.3, thickness=0.1), Asphere(radius=-2.0, thickness=0.1, conic=0.7),
+    Surface(radius=math.inf, thickness=0.1),
+    Asphere(radius=1.67, thickness=0.1, conic=-1.0, even=(-0.1, 0.014, -1.5e-3)),
+], ids=["sphere", "ellipsoid", "plane", "asphere"])  # fmt: skip
 def test_rays_meet_the_surface_and_its_normal_stands_on_it(surface: Surface) -> None:
     generator = torch.Generator().manual_seed(3)
     points = torch.rand((50, 3), dtype=torch.float64, generator=generator) - 0.5
@@ -273,17 +263,13 @@ RAYS = ((0.02, -0.03, 0.05, 0.1), (-0.05, 0.02, -0.1, 0.02), (0.01, 0.04, 0.08, 
 
 OPTILAND = {
     "surveillance": [(0.07369570274457, 0.12737694709939, -0.20657122148397, -0.30984280949685)],
-    "machine-vision": [
-        (0.09883435249064, 0.19800314785043, -0.03589075996423, -0.03670945774654),
+    "machine-vision": [(0.09883435249064, 0.19800314785043, -0.03589075996423, -0.03670945774654),
         (-0.19598460585771, 0.03908342979135, 0.07719613309069, -0.02047063769068),
-        (0.15722553326381, -0.23644894857965, -0.04575138481677, 0.04110607862647),
-    ],
-    "webcam": [
-        (0.27936895208818, 0.55910670256236, 0.05264056832421, 0.11780128856756),
+        (0.15722553326381, -0.23644894857965, -0.04575138481677, 0.04110607862647)],
+    "webcam": [(0.27936895208818, 0.55910670256236, 0.05264056832421, 0.11780128856756),
         (-0.55858057371511, 0.11168254297711, -0.1036428434514, 0.01894132485849),
-        (0.44601186492501, -0.6695211643764, 0.08744689593979, -0.14103321960917),
-    ],
-}
+        (0.44601186492501, -0.6695211643764, 0.08744689593979, -0.14103321960917)],
+}  # fmt: skip
 
 # fmt: on
 @pytest.mark.parametrize("name", NAMES)

@@ -122,26 +122,17 @@ def sea() -> NDArray[np.float64]:
     return level + np.random.default_rng(0).normal(0.0, 1.0, level.shape)
 
 
-@pytest.mark.parametrize(
-    ("change", "kind", "said"),
-    [
-        (lambda: {"raster": raster_of(other_terrain())}, InputError, "the raster contradicts the image"),
-        (lambda: {"raster": raster_of(heights() - 48.0)}, InputError, r"60 m above the raster's ground.*--geoid"),
-        (lambda: {"raster": raster_of(heights()[200:280, 200:280])}, InputError, "has no horizon in .* directions"),
-        (
-            lambda: {
-                "image": sea(), "raster": raster_of(np.zeros((480, 480)), 200.0),
-                "place": Origin(lat=47.0, lon=11.0, height=12.0),
-            },
-            DegenerateError, "too flat to tell the heading",
-        ),
-        (lambda: {"image": image(air=HillWeather(haze=9_000.0, light=0.004))}, InputError, "clear in .* columns only"),
-        (lambda: {"image": np.roll(small_site().image, 135, 0)}, InputError, "clear in|contradicts"),
-        (lambda: {"image": small_site().image[:-1]}, InputError, "480 x 269 pixels, the camera 480 x 270"),
-        (lambda: {"place_sigma": (1.0, 0.0, 1.0)}, InputError, "three positive numbers"),
-    ],
-    ids=["elsewhere", "geoid", "too small", "sea", "night", "no sky", "size", "sigma"],
-)  # fmt: skip
+@pytest.mark.parametrize(("change", "kind", "said"), [
+    (lambda: {"raster": raster_of(other_terrain())}, InputError, "the raster contradicts the image"),
+    (lambda: {"raster": raster_of(heights() - 48.0)}, InputError, r"60 m above the raster's ground.*--geoid"),
+    (lambda: {"raster": raster_of(heights()[200:280, 200:280])}, InputError, "has no horizon in .* directions"),
+    (lambda: {"image": sea(), "raster": raster_of(np.zeros((480, 480)), 200.0),
+        "place": Origin(lat=47.0, lon=11.0, height=12.0)}, DegenerateError, "too flat to tell the heading"),
+    (lambda: {"image": image(air=HillWeather(haze=9_000.0, light=0.004))}, InputError, "clear in .* columns only"),
+    (lambda: {"image": np.roll(small_site().image, 135, 0)}, InputError, "clear in|contradicts"),
+    (lambda: {"image": small_site().image[:-1]}, InputError, "480 x 269 pixels, the camera 480 x 270"),
+    (lambda: {"place_sigma": (1.0, 0.0, 1.0)}, InputError, "three positive numbers"),
+], ids=["elsewhere", "geoid", "too small", "sea", "night", "no sky", "size", "sigma"])  # fmt: skip
 def test_refusals(change: Any, kind: type[InputError], said: str) -> None:
     with pytest.raises(kind, match=said):
         found(**change())

@@ -229,28 +229,19 @@ def test_clouds_are_not_the_skyline() -> None:
     assert (np.abs(found.row - wavy())[found.clear] < 2.0).mean() > 0.9
 
 
-@pytest.mark.parametrize(
-    "image",
-    [
-        np.random.default_rng(0).normal(3.0, 1.0, (ROWS, COLUMNS)),
-        gaussian_filter(np.random.default_rng(1).normal(0.0, 40.0, (ROWS, COLUMNS)), 1.5),
-        drawn(np.full(COLUMNS, 3.0)),
-    ],
-    ids=["night", "texture everywhere", "no sky"],
-)
+@pytest.mark.parametrize("image", [
+    np.random.default_rng(0).normal(3.0, 1.0, (ROWS, COLUMNS)),
+    gaussian_filter(np.random.default_rng(1).normal(0.0, 40.0, (ROWS, COLUMNS)), 1.5),
+    drawn(np.full(COLUMNS, 3.0)),
+], ids=["night", "texture everywhere", "no sky"])  # fmt: skip
 def test_where_there_is_none_few_columns_are_clear(image: NDArray[np.float64]) -> None:
     assert sky_border(image).clear.mean() < 0.1
 
 
-@pytest.mark.parametrize(
-    ("image", "said"),
-    [
-        (np.zeros((ROWS, COLUMNS)), "one gray level"),
-        (np.zeros((ROWS, COLUMNS, 3)), "gray levels is needed"),
-        (np.full((ROWS, COLUMNS), np.nan), "not finite"),
-        (np.zeros((10, 10)), "is needed"),
-    ],
-)
+@pytest.mark.parametrize(("image", "said"), [
+    (np.zeros((ROWS, COLUMNS)), "one gray level"), (np.zeros((ROWS, COLUMNS, 3)), "gray levels is needed"),
+    (np.full((ROWS, COLUMNS), np.nan), "not finite"), (np.zeros((10, 10)), "is needed"),
+])  # fmt: skip
 def test_what_is_no_image(image: NDArray[np.float64], said: str) -> None:
     with pytest.raises(InputError, match=said):
         sky_border(image)
