@@ -126,24 +126,12 @@ def test_onnx_refuses_what_it_cannot_write(tmp_path: Path) -> None:
         save_onnx(make_camera("opencv5"), POINTS[None], tmp_path / "camera.onnx")
 
 
-class ThereAndBack(nn.Module):
-    """Pixels of points, and their rays: both directions in one graph."""
-
-    def __init__(self, camera: Camera) -> None:
-        super().__init__()
-        self.camera = camera
-
-    def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        pixels, seen = self.camera.project(points)
-        rays, valid = self.camera.unproject(pixels)
-        return torch.cat([pixels, rays], -1), torch.stack([seen, valid])
-
-
 @pytest.mark.slow
 @traced_whole
-def test_code_is_generated() -> None:
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_code_is_generated(direction: str) -> None:
     """With the real compiler, not only the tracer; one model, because it takes long."""
-    module, points = ThereAndBack(make_camera("opencv4")), POINTS.repeat(3, 1)
+    module, points = module_and_input(make_camera("opencv5"), direction, 3)
     assert_same(torch.compile(module, fullgraph=True)(points), module(points))
 
 
