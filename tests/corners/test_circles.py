@@ -177,21 +177,6 @@ def test_refinements_for_corners_are_refused(papers):
         detect_board(image, Board.parse("circles:2x6", "25mm"))
 
 
-def test_ellipse_derivatives():
-    from kcal.corners.circles import _system
-
-    p = torch.tensor([[0.3, -0.2, 0.12, 0.02, 0.15, 200.0, -150.0, 0.9, 0.1, -0.2]], dtype=torch.float64)
-    axis = torch.arange(-12.0, 13.0, dtype=torch.float64)
-    where = torch.cartesian_prod(axis, axis)[None]
-    levels, weight = torch.full((1, len(where[0])), 100.0), torch.ones(1, len(where[0]))
-    gradient = _system(p, where, levels.double(), weight.double())[2][0]
-    for i in range(10):
-        step = torch.zeros_like(p)
-        step[0, i] = 1e-6
-        above, below = (_system(p + sign * step, where, levels.double(), weight.double())[0] for sign in (1, -1))
-        assert float((above - below) / 4e-6) == pytest.approx(float(gradient[i]), rel=1e-5, abs=0.5)
-
-
 def test_ellipses_beside_each_other_do_not_matter():
     """Half the distance of two circles is used at most; blur of 1.5 px and a ramp of light as well."""
     v, u = (np.mgrid[:640, :960] + 0.5) / 8 - 0.5

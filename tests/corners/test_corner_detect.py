@@ -20,14 +20,10 @@ from kcal import Board, InputError, Observations, detect
 from kcal.corners import detect_board
 from kcal.corners.grid import (
     as_grid,
-    cell_levels,
-    false_sides,
     first_square_dark,
     goes_on,
     grid_trouble,
     local_side,
-    skips,
-    without_false_sides,
 )
 from kcal.corners.images import read_gray
 from kcal.corners.patches import filtered, gaussian_kernel
@@ -129,14 +125,6 @@ def test_no_view_of_a_board_is_taken_for_a_small_board(stereo):
     found = detect_board(image, Board(columns=5, rows=4, square=0.025))
     assert found.pixels is None
     assert re.match("a (board|grid) of 9x6 inner corners was found", found.reason)
-
-
-def test_another_size_is_told(tmp_path):
-    H = homography(BOARD, (640, 480), 25, (0.2, 0.1), 0.1)
-    image, _ = render(BOARD, (640, 480), H, supersample=2)
-    cv2.imwrite(str(tmp_path / "a.png"), image)
-    with pytest.raises(InputError, match="a board of 9x6 was found: give --board 9x6"):
-        detect([tmp_path / "a.png"], Board(columns=8, rows=6, square=0.025))
 
 
 @pytest.mark.parametrize(("dx", "dy", "radius"), [(3, 2, 5), (4, 0, 6), (5, 5, 8), (0, 0, 9)])
@@ -243,25 +231,6 @@ def test_real_images_all_found_and_three_methods_agree(stereo):
         assert float(seen.double().mean()) > 0.99
         # What the methods make of JPEG blocks and blur; a slip of half a pixel or of an axis would be far more.
         assert float(apart[seen].square().mean().sqrt()) < limit
-
-
-@pytest.mark.slow
-def test_real_calibration_reaches_the_known_residual(stereo):
-    for side in ("left", "right"):
-        seen = detect([path for path in stereo if path.name.startswith(side)], BOARD)
-        views = [p.numpy().astype(np.float32) for p in seen.pixels()]
-        good = [np.isfinite(view).all(-1) for view in views]
-        points = BOARD.points.numpy().astype(np.float32)
-        result = cv2.calibrateCamera(
-            [points[keep] for keep in good],
-            [view[keep] for view, keep in zip(views, good, strict=True)],
-            seen.image_size,
-            None,
-            None,
-            criteria=(3, 300, 1e-12),
-        )
-        # 0.165 left and 0.163 right; cornerSubPix with a half-window of 11 leaves 0.41 and 0.46.
-        assert result[0] < 0.17
 
 
 def test_detection_does_not_depend_on_what_was_called_before(stereo):
@@ -384,18 +353,6 @@ def test_local_side():
     assert local_side(stretched, 4, 3).tolist() == [10.0, 10.0, 10.0, 14.0] * 3
     with pytest.raises(InputError, match=r"shape \(12, 2\) is needed for 4x3"):
         local_side(points[:-1], 4, 3)
-
-
-def test_cell_levels_and_first_square():
-    board = Board(columns=5, rows=4, square=0.02)
-    image, truth = flat(board, 10)
-    levels = cell_levels(image, truth.reshape(4, 5, 2))
-    assert levels.shape == (3, 4)
-    assert float(levels[0, 0]) == pytest.approx(40, abs=3)  # dark gray of the renderer, noise 1
-    assert float(levels[0, 1]) == pytest.approx(215, abs=3)
-    assert first_square_dark(image, truth.reshape(4, 5, 2)) == (True, 1.0)
-    light_first, _ = flat(board, 10, dark_first=False)
-    assert first_square_dark(light_first, truth.reshape(4, 5, 2)) == (False, 1.0)
 
 
 @pytest.mark.parametrize("degrees", [0, 40, 180])
@@ -556,37 +513,6 @@ def test_the_edge_of_a_cover_is_not_the_end_of_the_board():
     assert not board_ends(image, grid, paper=True)[3]
     found = detect_board(image, BOARD)
     assert found.pixels is None
-
-
-def test_another_board_is_named():
-    image, _ = picture(Board(columns=8, rows=6, square=0.025))
-    found = detect_board(image, BOARD)
-    assert found.reason == "a board of 8x6 inner corners was found, not 9x6: give --board 8x6"
-
-
-def test_the_edge_of_the_paper_is_no_line_of_corners():
-    board = Board(columns=8, rows=6, square=0.025)
-    image, truth = picture(board)
-    grid = truth.reshape(6, 8, 2)
-    assert not bool(false_sides(image, truth.reshape(6, 8, 2)).any())
-    longer = torch.cat([grid, (2 * grid[:, -1:] - grid[:, -2:-1])], 1)
-    # Dark ground begins a tenth of a square outside the outer squares.
-    out = (longer[:, -1] - longer[:, -2]).mean(0)
-    ends = longer[:, -1] + 0.1 * out
-    down = grid[1, 0] - grid[0, 0]
-    area = torch.stack(
-        [ends[0] - 4 * down, ends[-1] + 4 * down, ends[-1] + 4 * down + 6 * out, ends[0] - 4 * down + 6 * out]
-    )
-    cv2.fillPoly(image, [area.round().int().numpy()], 50)
-    assert false_sides(image, longer).tolist() == [False, False, False, True]
-    assert without_false_sides(image, longer).shape == (6, 8, 2)
-
-
-def test_every_other_line_is_noticed():
-    image, truth = picture()
-    assert not skips(image, truth.reshape(6, 9, 2))
-    assert skips(image, truth.reshape(6, 9, 2)[:5:2])
-    assert skips(image, truth.reshape(6, 9, 2)[:, ::2])
 
 
 def test_sharpened_edges_lose_no_corners():

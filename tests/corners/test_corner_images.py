@@ -59,16 +59,6 @@ def test_sixteen_bits_stay_sixteen(picture, tmp_path):
         assert (image == deep).all()
 
 
-def test_exif_orientation_is_ignored(picture):
-    # APP1 segment: TIFF header and one tag, 0x0112 (orientation) = 6 (turn by 90 degrees).
-    tiff = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
-    body = b"Exif\0\0" + tiff
-    plain = encoded(picture, ".jpg")
-    turned = plain[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + plain[2:]
-    assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (160, 120)  # the tag works
-    assert (decode_gray(turned, "x") == decode_gray(plain, "x")).all()
-
-
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tiff", ".bmp", ".webp"])
 def test_truncated_files_are_refused(picture, suffix, share, capfd):

@@ -1,3 +1,4 @@
+import functools
 import math
 
 import numpy as np
@@ -91,14 +92,14 @@ def texture(seed, points):
     return 120 + 9 * torch.cos(points @ frequency.T + phase).sum(-1)
 
 
-def stereo(distance=60.0, noise=0.0, seed=0):
+@functools.cache
+def exact_stereo():
     """A rig that looks at a textured wall through two different lenses, and its exact images."""
     build = {"focal": (900, 905), "center": (161.0, 119.0), "size": (320, 240)}
     left = Camera.build(**build, coefficients=[-0.2, 0.05])
     right = Camera.build(focal=(930, 925), center=(158.0, 122.0), size=(320, 240), coefficients=[-0.1, 0.02, 1e-3])
     turn = rotation_from_vector(torch.tensor([0.004, -0.01, 0.03], dtype=torch.float64))
     rig = Rig.pair(left, right, turn, torch.tensor([-2.0, 0.05, 0.1], dtype=torch.float64))
-    generator = torch.Generator().manual_seed(seed)
     images = []
     for camera, R, t in (
         (left, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)),
@@ -107,10 +108,16 @@ def stereo(distance=60.0, noise=0.0, seed=0):
         rays, _ = camera.unproject(camera.grid(320, 240))
         rays = rays @ R  # into the left frame
         center = -R.T @ t
-        wall = center + rays * ((distance - center[2]) / rays[..., 2])[..., None]
-        image = texture(3, wall[..., :2] / distance)
-        images.append(image + noise * torch.randn(image.shape, generator=generator, dtype=torch.float64))
-    return rig, *images
+        wall = center + rays * ((60.0 - center[2]) / rays[..., 2])[..., None]
+        images.append(texture(3, wall[..., :2] / 60.0))
+    return rig, images
+
+
+def stereo(noise=0.0, seed=0):
+    rig, images = exact_stereo()
+    generator = torch.Generator().manual_seed(seed)
+    drawn = (torch.randn(image.shape, generator=generator, dtype=torch.float64) for image in images)
+    return rig, *(image + noise * each for image, each in zip(images, drawn, strict=True))
 
 
 def truth_of(rig, pixels, distance):

@@ -37,13 +37,10 @@ from kcal.corners.grid import (
     contrast,
     false_sides,
     first_square_dark,
-    goes_on,
-    grid_trouble,
     levels_at,
     levels_beside,
     neighbors,
     sharpness,
-    skips,
     without_false_sides,
 )
 from kcal.corners.marker_boards import in_place, inliers
@@ -128,22 +125,6 @@ class TestGrid:
         blurred = cv2.GaussianBlur(image.astype(np.float64), (0, 0), share * SQUARE)
         assert sharpness(image, grid) == pytest.approx(1.0)
         assert sharpness(blurred, grid) == pytest.approx(expected, abs=0.03)
-
-    def test_parts_of_a_board_are_told(self) -> None:
-        image, grid = squares(8, 7)
-        whole = grid.reshape(-1, 2)
-        assert grid_trouble(image, whole, 7, 6) is None
-        assert not goes_on(image, whole.reshape(6, 7, 2))
-        assert not skips(image, whole.reshape(6, 7, 2))
-        for part in (grid[:-1], grid[1:], grid[:, :-1], grid[:, 1:]):
-            rows, columns = part.shape[:2]
-            assert goes_on(image, part)
-            trouble = grid_trouble(image, part.reshape(-1, 2), columns, rows)
-            assert trouble is not None
-            assert "go on beyond" in trouble
-        every_other = grid[::2]
-        assert skips(image, every_other)
-        assert skips(image, grid[:, ::2])
 
     def test_the_edge_of_the_board_is_no_line_of_corners(self) -> None:
         """On dark ground the outer edge looks like another line."""

@@ -13,9 +13,8 @@ from kcal.corners.detect import detect, detect_board, view_of
 from kcal.corners.images import read_gray
 from kcal.corners.marker_boards import _opencv_board, find_aprilgrid, find_charuco, free_side
 from kcal.corners.markers import marker_cells, opencv_dictionary
-from kcal.corners.print_board import board_sheet, pattern_shapes
+from kcal.corners.print_board import pattern_shapes
 from kcal.corners.search import NotFoundError
-from kcal.lens import rotation_from_vector
 from scripts.bench.hard_boards import covered, cut, moving, noisy, pictures, plain, small
 from scripts.bench.hard_scenes import Marked
 from scripts.bench.marked_boards import WRONG
@@ -162,55 +161,19 @@ def test_wrong_target_says_what_was_seen(paper, tmp_path):
 
 CHARUCO = Board.parse("charuco:9x6", "25mm")
 
-FINE = 8  # printed pixels a millimeter
-
 
 @pytest.fixture(scope="module")
 def charuco_paper():
-    """The printed page, FINE pixels a millimeter, 1 white; and where corner 0 is, in millimeters."""
-    drawing = board_sheet(CHARUCO, "A4").drawing
-    page = np.ones((round(drawing.height * FINE), round(drawing.width * FINE)), np.float32)
-    for r in drawing.rectangles:
-        page[round(r.y * FINE) : round((r.y + r.height) * FINE), round(r.x * FINE) : round((r.x + r.width) * FINE)] = 0
-    first = drawing.rectangles[0]
-    return torch.from_numpy(page), torch.tensor([first.x + 25, first.y + 25], dtype=torch.float64)
+    return Paper(CHARUCO, cell_mm=0.25)
 
 
-def shoot(charuco_paper, camera, rotation, translation, seed=0):
-    """A photograph of the page: 2x2 samples a pixel of the blurred page, then noise; and the true corners."""
-    page, origin = charuco_paper
-    width, height = camera.size
-    page = torch.nn.functional.avg_pool2d(page[None, None], 4)  # a quarter of the print's resolution: 2 px a mm
-    scale = FINE / 4
-    light = torch.zeros(height, width, dtype=torch.float64)
-    for dy in (-0.25, 0.25):
-        for dx in (-0.25, 0.25):
-            pixels = camera.grid(width, height) + torch.tensor([dx, dy], dtype=torch.float64)
-            rays = camera.unproject(pixels)[0] @ rotation  # into the board's frame
-            center = -rotation.T @ translation
-            hit = center + rays * (-center[2] / rays[..., 2])[..., None]
-            where = (1000 * hit[..., :2] + origin) * scale - 0.5
-            size = torch.tensor([page.shape[-1] - 1.0, page.shape[-2] - 1.0], dtype=torch.float64)
-            sample = torch.nn.functional.grid_sample(
-                page.double(), (2 * where / size - 1)[None], align_corners=True, padding_mode="zeros"
-            )
-            light += sample[0, 0] / 4
-    noise = torch.randn(light.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    image = (40 + 170 * light + 1.5 * noise).round().clamp(0, 255).to(torch.uint8).numpy()
-    points = CHARUCO.points @ rotation.T + translation
-    return image, camera.project(points)[0]
+def shoot(charuco_paper, camera, tilt, distance, shift=(0.0, 0.0), **options):
+    return charuco_paper.shoot(camera, *pose(CHARUCO, tilt, distance, shift), supersample=2, **options)
 
 
 FINE_CAMERA = Camera.build(focal=(1400, 1400), center=(600, 450), size=(1200, 900))
 
 CHARUCO_CAMERA = Camera.build(focal=(560, 560), center=(241, 178), size=(480, 360), coefficients=[-0.1, 0.02])
-
-
-def charuco_pose(tilt, shift, distance=0.36):
-    rotation = rotation_from_vector(torch.tensor(tilt, dtype=torch.float64))
-    middle = CHARUCO.points.mean(0)
-    place = torch.tensor([*shift, distance], dtype=torch.float64)
-    return rotation, place - rotation @ middle
 
 
 class TestBoard:
@@ -254,26 +217,26 @@ class TestBoard:
 
 class TestDetection:
     def test_printed_board_is_found_in_order(self, charuco_paper):
-        image, truth = shoot(charuco_paper, CHARUCO_CAMERA, *charuco_pose([0.2, -0.15, 0.1], [0.0, 0.0], 0.4))
+        image, truth = shoot(charuco_paper, CHARUCO_CAMERA, [0.2, -0.15, 0.1], 0.4)
         found = detect_board(image, CHARUCO)
         error = found.pixels - truth
         assert bool(torch.isfinite(error).all())
-        # 0.03: a window of 6 px, and the page is drawn on a grid of half a millimeter.
+        # 0.03: a window of 6 px.
         assert float(error.square().mean().sqrt()) < 0.03
         assert found.covariance is not None
 
     def test_upside_down(self, charuco_paper):
-        image, truth = shoot(charuco_paper, CHARUCO_CAMERA, *charuco_pose([0.1, 0.05, 3.1], [0.0, 0.0], 0.4))
+        image, truth = shoot(charuco_paper, CHARUCO_CAMERA, [0.1, 0.05, 3.1], 0.4)
         assert float((detect_board(image, CHARUCO).pixels - truth).abs().nan_to_num().max()) < 0.2
 
     def test_a_board_printed_white_on_black(self, charuco_paper):
-        image, _ = shoot(charuco_paper, CHARUCO_CAMERA, *charuco_pose([0.2, -0.15, 0.1], [0.0, 0.0], 0.4))
+        image, _ = shoot(charuco_paper, CHARUCO_CAMERA, [0.2, -0.15, 0.1], 0.4)
         pixels, inverted = (detect_board(each, CHARUCO).pixels for each in (image, 255 - image))
         assert float((inverted - pixels).abs().max()) < 0.05
 
     @pytest.mark.parametrize("tilt", [[1.25, 0.0, 0.0], [0.75, 1.0, 0.0]])
     def test_a_board_seen_at_seventy_degrees(self, tilt, charuco_paper):
-        image, truth = shoot(charuco_paper, FINE_CAMERA, *charuco_pose(tilt, [0.0, 0.0], 0.3))
+        image, truth = shoot(charuco_paper, FINE_CAMERA, tilt, 0.3, blur=0.4)
         found = detect_board(image, CHARUCO).pixels
         seen = torch.isfinite(found).all(-1)
         assert int(seen.sum()) >= 20
@@ -281,7 +244,7 @@ class TestDetection:
 
     def test_another_number_of_columns_is_no_board(self, charuco_paper):
         """Half of the markers lie as on a board of other columns: rows of markers are parallel on both."""
-        image, _ = shoot(charuco_paper, CHARUCO_CAMERA, *charuco_pose([0.2, -0.15, 0.1], [0.0, 0.0], 0.4))
+        image, _ = shoot(charuco_paper, CHARUCO_CAMERA, [0.2, -0.15, 0.1], 0.4)
         for size in ("charuco:6x9", "charuco:8x6", "charuco:10x6"):
             assert detect_board(image, Board.parse(size, "25mm")).reason.startswith("the markers do not lie as on this")
 
@@ -303,7 +266,7 @@ class TestDetection:
         assert np.abs(plane - pixels).max() < (0.12 if corners > 12 else 2.5)
 
     def test_a_part_at_the_border_is_enough(self, charuco_paper):
-        image, truth = shoot(charuco_paper, CHARUCO_CAMERA, *charuco_pose([0.1, -0.2, 0.0], [0.12, 0.08], 0.4))
+        image, truth = shoot(charuco_paper, CHARUCO_CAMERA, [0.1, -0.2, 0.0], 0.4, (0.12, 0.08))
         found = detect_board(image, CHARUCO)
         seen = torch.isfinite(found.pixels).all(-1)
         assert 8 <= int(seen.sum()) <= 40
@@ -316,7 +279,7 @@ class TestDetection:
         shifts = [[0.1, 0.06], [-0.1, 0.05], [0.08, -0.06], [-0.09, -0.05], [0.0, 0.0]]
         views = []
         for i, (tilt, shift) in enumerate(zip(tilts, shifts, strict=True)):
-            image, _ = shoot(charuco_paper, CHARUCO_CAMERA, *charuco_pose(tilt, shift), seed=i)
+            image, _ = shoot(charuco_paper, CHARUCO_CAMERA, tilt, 0.36, shift, seed=i)
             views.append(view_of(detect_board(image, CHARUCO), f"{i}"))
         assert any(None in view.pixels for view in views)
         result = calibrate_camera(Observations(board=CHARUCO, image_size=(480, 360), views=tuple(views)))
@@ -324,7 +287,7 @@ class TestDetection:
         assert float(result.camera.focal[0]) == pytest.approx(560, abs=4)
 
     def test_nothing_and_too_little(self, charuco_paper):
-        image, _ = shoot(charuco_paper, CHARUCO_CAMERA, *charuco_pose([0.0, 0.0, 0.0], [0.0, 0.0], 0.4))
+        image, _ = shoot(charuco_paper, CHARUCO_CAMERA, [0.0, 0.0, 0.0], 0.4)
         assert "fewer than 6 corners" in detect_board(np.full_like(image, 200), CHARUCO).reason
         image[:, 90:] = 200
         assert detect_board(image, CHARUCO).pixels is None
@@ -338,9 +301,7 @@ class TestDetection:
 
 
 def test_commands(charuco_paper, tmp_path, command: Command):
-    import cv2
-
-    image, _ = shoot(charuco_paper, CHARUCO_CAMERA, *charuco_pose([0.2, -0.15, 0.1], [0.0, 0.0], 0.4))
+    image, _ = shoot(charuco_paper, CHARUCO_CAMERA, [0.2, -0.15, 0.1], 0.4)
     cv2.imwrite(str(tmp_path / "a.png"), image)
     output = tmp_path / "a.obs.json"
     what = ["--board", "charuco:9x6", "--square", "25mm", "-o"]

@@ -95,14 +95,17 @@ def patches(shift: tuple[float, float], gain: float = 1.0, half: int = 8) -> tup
     return template, image, places, slopes
 
 
+def fitted(template: Tensor, image: Tensor, places: Tensor, slopes: Tensor, **options: bool) -> ShiftFit:
+    """The shifts of all patches in an image."""
+    windows, wanted = image_windows(image, places, 0, math.inf), torch.ones(len(places), dtype=torch.bool)
+    return fit_shifts(template, windows, places, slopes, torch.ones_like(template), wanted, **options)
+
+
 class TestShifts:
     @pytest.mark.parametrize("sheared", [False, True])
     @pytest.mark.parametrize("robust", [False, True])
     def test_a_shift_is_found_whatever_light_there_is(self, robust: bool, sheared: bool) -> None:
-        template, image, places, slopes = patches((0.7, -0.4), gain=1.3)
-        windows = image_windows(image, places, 0, math.inf)
-        found = fit_shifts(template, windows, places, slopes, torch.ones_like(template), torch.tensor([True]),
-                           robust=robust, sheared=sheared)  # fmt: skip
+        found = fitted(*patches((0.7, -0.4), gain=1.3), robust=robust, sheared=sheared)
         assert bool(found.converged.all())
         torch.testing.assert_close(found.shift, tensor([0.7, -0.4]), rtol=0, atol=2e-4)
         assert float(found.share[0]) > 0.8
@@ -112,9 +115,7 @@ class TestShifts:
         middle = tensor(36.0, 36.0)
         away = places - middle
         squeezed = middle + torch.stack([away[..., 0] * 0.97 - 0.02 * away[..., 1] + 0.5, away[..., 1]], -1)
-        windows = image_windows(image, squeezed, 0, math.inf)
-        arguments = template, windows, squeezed, slopes, torch.ones_like(template), torch.tensor([True])
-        plain, sheared = fit_shifts(*arguments), fit_shifts(*arguments, sheared=True)
+        plain, sheared = (fitted(template, image, squeezed, slopes, sheared=sheared) for sheared in (False, True))
         assert abs(float(sheared.shift[0, 0]) + 0.5) < 2e-3
         assert sheared.shear[0].tolist() == pytest.approx([0.03, 0.02], rel=0.1)
         assert plain.shear[0].tolist() == [0.0, 0.0]
@@ -126,10 +127,9 @@ class TestShifts:
         spoilt = noisy.clone()
         spoilt[28:34, 28:34] += 90.0
         clean, robust, plain = (
-            fit_shifts(template, image_windows(shown, places, 0, math.inf), places, slopes, torch.ones_like(template),
-                       torch.tensor([True]), robust=robust)
+            fitted(template, shown, places, slopes, robust=robust)
             for shown, robust in ((noisy, True), (spoilt, True), (spoilt, False))
-        )  # fmt: skip
+        )
         wanted = tensor([0.3, 0.2])
         assert float((robust.shift - wanted).norm()) < 0.05
         assert float((plain.shift - wanted).norm()) > 3.0 * float((robust.shift - wanted).norm())
@@ -141,8 +141,7 @@ class TestShifts:
         found: list[ShiftFit] = []
         for _ in range(count):
             noisy = image + 3.0 * torch.randn(image.shape, generator=generator, dtype=torch.float64)
-            windows = image_windows(noisy, places, 0, math.inf)
-            found.append(fit_shifts(template, windows, places, slopes, torch.ones_like(template), torch.tensor([True])))
+            found.append(fitted(template, noisy, places, slopes))
         error = torch.cat([one.shift for one in found]) - tensor([0.3, 0.2])
         stated = torch.cat([one.covariance for one in found]).mean(0).diagonal()
         ratio = error.square().mean(0) / stated
@@ -155,15 +154,10 @@ class TestShifts:
         image, generator = texture(3, 600), torch.Generator().manual_seed(6)
         middle = 20.0 + 560.0 * torch.rand(300, 1, 1, 2, generator=generator, dtype=torch.float64)
         places = middle + grid_of((half, half), image.device)
-        first, second = (
-            image_windows(
-                image + 12.0 * torch.randn(image.shape, generator=generator, dtype=torch.float64), places, 0, math.inf
-            )
-            for _ in range(2)
-        )
+        noise = torch.randn(2, *image.shape, generator=generator, dtype=torch.float64)
+        first, second = image + 12.0 * noise
         slopes = torch.eye(2, dtype=torch.float64).expand(*places.shape, 2)
-        template, wanted = sample(first, places), torch.ones(300, dtype=torch.bool)
-        found = fit_shifts(template, second, places, slopes, torch.ones_like(template), wanted)
+        found = fitted(sample(image_windows(first, places, 0, math.inf), places), second, places, slopes)
         ratio = (found.shift / found.covariance.diagonal(dim1=1, dim2=2).sqrt())[found.converged]
         assert len(ratio) > 270
         # 540 numbers know their RMS to 3 %.
@@ -194,10 +188,9 @@ class TestShifts:
         other = texture(9) - 120.0
 
         def shift(step: float) -> Tensor:
-            windows = image_windows(image + step * other, places, 0, math.inf)
             # A fixed scale of residuals: weights that do not depend on it.
-            return fit_shifts(template + step * direction, windows, places, slopes, torch.ones_like(template),
-                              torch.tensor([True]), robust=False, sheared=sheared).shift[0]  # fmt: skip
+            moved = template + step * direction, image + step * other
+            return fitted(*moved, places, slopes, robust=False, sheared=sheared).shift[0]
 
         for axis in (0, 1):
             by_template, by_image = torch.autograd.grad(shift(0.0)[axis], (template, image))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from pathlib import Path
 
@@ -21,12 +22,16 @@ from kcal.io.images import write_png
 from scripts.shared.printed_board import Paper, pose
 
 CAMERA = Camera.build(focal=(700, 700), center=(379.5, 279.5), size=(760, 560))
-TILTS = ([0.1, 0.1, 0.1], [0.7, 0.1, 1.4], [-0.2, 0.6, -0.4])
+TILTS = ((0.1, 0.1, 0.1), (0.7, 0.1, 1.4), (-0.2, 0.6, -0.4))
 
 
-def shots(board: Board, distance: float, *tilts: list[float]) -> list[NDArray[np.uint8]]:
-    paper = Paper(board, cell_mm=0.5)
-    return [paper.shoot(CAMERA, *pose(board, tilt, distance), supersample=1)[0] for tilt in tilts or TILTS]
+@functools.cache
+def shot(board: Board, distance: float, tilt: tuple[float, ...]) -> NDArray[np.uint8]:
+    return Paper(board, cell_mm=0.5).shoot(CAMERA, *pose(board, tilt, distance), supersample=1)[0]
+
+
+def shots(board: Board, distance: float, *tilts: tuple[float, ...]) -> list[NDArray[np.uint8]]:
+    return [shot(board, distance, tilt).copy() for tilt in tilts or TILTS]
 
 
 @pytest.mark.parametrize(("text", "square", "distance"), [

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from opencv_files import file_storage
 from scipy.io import savemat
 
 from kcal import FileError, InputError, Observations, View
@@ -296,12 +297,8 @@ def test_csv_in_any_order(tmp_path: Path, by: str) -> None:
 
 
 def test_opencv(tmp_path: Path) -> None:
-    path = tmp_path / "out.yml"
     points = np.arange(24, dtype=np.float32).reshape(2, 6, 2)
-    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in (("image_width", 640), ("image_height", 480), ("image_points", points)):
-        file.write(name, value)
-    file.release()
+    path = file_storage(tmp_path / "out.yml", image_width=640, image_height=480, image_points=points)
     seen = import_corners(path, BOARD)
     assert (seen.image_size, seen.names) == (SIZE, ("001", "002"))
     assert seen.views[1].pixels[5] == (22.0, 23.0)

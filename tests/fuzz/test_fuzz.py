@@ -29,8 +29,8 @@ from scripts.fuzz.readers import missing
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="cases run in child processes")
 
-# Of each harness: one or two seconds of computing.
-CASES, FEWER = 150, {"commands": 12, "mrcal .cameramodel": 40}
+# Of each harness: a second of computing.
+CASES, FEWER = 100, {"commands": 12, "mrcal .cameramodel": 40}
 CORPUS = Path(__file__).parent / "corpus"
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcal.lens.camera import Camera
-from kcal.lens.model import HybridForm, LensModel, distort_components, radius_over_angle
+from kcal.lens.model import PRESETS, HybridForm, LensModel, distort_components, radius_over_angle
 from kcal.lens.zernike import ASPECT, ASTIGMATIC, DECENTERED, OTHER, RADIAL, TILTED, ZernikeModes
 
 MODELS = ("opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "ext20", "ext24")
@@ -65,6 +65,18 @@ def parameters(model: str | LensModel, lens: Tensor) -> Tensor:
     head = torch.tensor([2.1, 1.7, 0.3, -0.2, 0.05], dtype=torch.float64)
     assert lens.shape == (LensModel.named(model).size,)
     return torch.cat([head, lens])
+
+
+# Every preset, and the model that has none because its constants are chosen for each camera.
+NAMED = {**PRESETS, "hybrid": HYBRID}
+
+
+def camera_of(preset: str, scale: float, focal: float = 1600.0) -> Camera:
+    """An HD camera with coefficients that are this share of strong ones; a fisheye's are always the same."""
+    model = NAMED[preset]
+    lens = torch.tensor([0.02, -0.01, 0.003, -0.0005]) if model.fisheye else scale * strong(model)
+    head = torch.tensor([focal, focal + 10.0, 955.0, 541.0, 2.0])
+    return Camera(torch.cat([head, lens]).double(), size=(1920, 1080), model=model)
 
 
 def distort_with_jacobian(normalized: Tensor, lens: Tensor, model: str | LensModel) -> tuple[Tensor, Tensor, Tensor]:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from opencv_files import file_storage
 from scipy.interpolate import BSpline
 from scipy.io import savemat
 
@@ -157,15 +158,12 @@ def test_opencv_standard_deviations(tmp_path: Path) -> None:
     views = [cv2.projectPoints(board, turn, np.array([-3.0, -2.5, 12]), matrix, np.zeros(5))[0] for turn in turns]
     noisy = [np.float32(view + draw.normal(0, 0.1, view.shape)) for view in views]
     _, k, d, _, _, deviations, _, _ = cv2.calibrateCameraExtended([board] * 8, noisy, (640, 480), None, None)
-    file = cv2.FileStorage(str(tmp_path / "c.yml"), cv2.FILE_STORAGE_WRITE)
-    for name, value in (("image_width", 640), ("image_height", 480), ("camera_matrix", k),
-                        ("distortion_coefficients", d), ("stdDeviationsIntrinsics", deviations)):  # fmt: skip
-        file.write(name, value)
-    file.release()
-    (camera,) = import_cameras(tmp_path / "c.yml").cameras
-    found = sigmas(camera)
-    del found[4]
-    assert found == pytest.approx(deviations[:9, 0].tolist())
+    found = {"camera_matrix": k, "distortion_coefficients": d, "stdDeviationsIntrinsics": deviations}
+    path = file_storage(tmp_path / "c.yml", image_width=640, image_height=480, **found)
+    (camera,) = import_cameras(path).cameras
+    stated = sigmas(camera)
+    del stated[4]
+    assert stated == pytest.approx(deviations[:9, 0].tolist())
 
 
 def test_matlab_errors(tmp_path: Path) -> None:
@@ -185,17 +183,14 @@ def test_an_omni_lens_is_never_another_silently(tmp_path: Path) -> None:
     """Kalibr's and OpenCV's omni lens becomes a hybrid one, with the distance stated."""
     chain = (f"cam0: {{camera_model: omni, distortion_model: radtan, intrinsics: {OMNI[:5]}, "
              f"distortion_coeffs: {OMNI[5:]}, resolution: [640, 480]}}\n")  # fmt: skip
-    file = cv2.FileStorage(str(tmp_path / "o.yml"), cv2.FILE_STORAGE_WRITE)
     matrix = np.array([[OMNI[1], 0, OMNI[3]], [0, OMNI[2], OMNI[4]], [0, 0, 1]])
-    for name, value in (("image_width", 640), ("image_height", 480), ("camera_matrix", matrix),
-                        ("distortion_coefficients", np.array(OMNI[5:])), ("xi", OMNI[0])):  # fmt: skip
-        file.write(name, value)
-    file.release()
+    lens = {"camera_matrix": matrix, "distortion_coefficients": np.array(OMNI[5:]), "xi": OMNI[0]}
+    other = file_storage(tmp_path / "o.yml", image_width=640, image_height=480, **lens)
     draw = np.random.default_rng(1)
     rays = np.concatenate([draw.uniform(-1.2, 1.2, (500, 2)), np.ones((500, 1))], 1)
     omnidir = cv2.omnidir.projectPoints(rays[None], np.zeros(3), np.zeros(3), matrix, OMNI[0], np.array([OMNI[5:]]))[0]
     pixels = omnidir.reshape(-1, 2)
-    for path in (write(tmp_path, "chain.yaml", chain), tmp_path / "o.yml"):
+    for path in (write(tmp_path, "chain.yaml", chain), other):
         found = import_cameras(path)
         (note,) = (note for note in found.notes if "omni-radtan lens became kcal's hybrid lens" in note)
         stated = float(note.split("at most ")[1].split(" px")[0])

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from opencv_files import file_storage
 from scipy.io import savemat
 
 from kcal.errors import FileError, InputError
@@ -99,15 +100,8 @@ class TestValues:
     def test_opencv_stereo_in_two_files(self, tmp_path: Path) -> None:
         """As OpenCV's sample stereo_calib writes it: without an image size, in units of the board."""
         matrix, lens = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]), np.array([[-0.2, 0.05, 0, 0, 0.01]])
-        inside, outside = str(tmp_path / "intrinsics.yml"), str(tmp_path / "extrinsics.yml")
-        file = cv2.FileStorage(inside, cv2.FILE_STORAGE_WRITE)
-        for name, value in (("M1", matrix), ("D1", lens), ("M2", matrix), ("D2", lens)):
-            file.write(name, value)
-        file.release()
-        file = cv2.FileStorage(outside, cv2.FILE_STORAGE_WRITE)
-        file.write("R", np.eye(3))
-        file.write("T", np.array([[-120.0], [0.0], [1.0]]))
-        file.release()
+        inside = file_storage(tmp_path / "intrinsics.yml", M1=matrix, D1=lens, M2=matrix, D2=lens)
+        outside = file_storage(tmp_path / "extrinsics.yml", R=np.eye(3), T=np.array([[-120.0], [0.0], [1.0]]))
         found = import_cameras(inside, outside, size=(640, 480), meters=1e-3)
         assert found.rig().right_from_left_translation.tolist() == pytest.approx([-0.12, 0, 0.001])
         assert found.cameras[1].params.tolist() == [500, 510, 320, 240, 0, -0.2, 0.05, 0, 0, 0.01]
@@ -134,12 +128,8 @@ class TestValues:
         assert import_cameras(path).cameras[0].size == (640, 480)
 
     def test_four_coefficients_of_opencv_are_told(self, tmp_path: Path) -> None:
-        path = tmp_path / "four.xml"
-        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-        for name, value in (("image_width", 640), ("image_height", 480), ("camera_matrix", np.eye(3))):
-            file.write(name, value)
-        file.write("distortion_coefficients", np.array([[0.1, 0.2, 0.3, 0.4]]))
-        file.release()
+        four = {"camera_matrix": np.eye(3), "distortion_coefficients": np.array([[0.1, 0.2, 0.3, 0.4]])}
+        path = file_storage(tmp_path / "four.xml", image_width=640, image_height=480, **four)
         found = import_cameras(path)
         assert str(found.cameras[0].model) == "opencv4"
         assert "--fisheye" in found.notes[0]

@@ -91,11 +91,3 @@ def test_a_skew_where_it_can_be_held(tmp_path: Path) -> None:
             wanted = camera("opencv5", skew=1.25)
             (path,) = known.write([wanted], [], tmp_path / f"skewed{SUFFIXES[name][0]}")
             same(import_cameras(path, format=name).cameras[0], wanted)
-
-
-@pytest.mark.parametrize("suffix", [".txt", ".bin"])
-def test_several_cameras_in_one_file(suffix: str, tmp_path: Path) -> None:
-    cameras = [camera("opencv4", number) for number in range(3)]
-    (path,) = FORMATS["colmap"].write(cameras, [], tmp_path / f"three{suffix}")
-    for got, wanted in zip(import_cameras(path, format="colmap").cameras, cameras, strict=True):
-        same(got, wanted)

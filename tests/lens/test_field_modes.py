@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from differences import numeric
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
-from torch.func import jacfwd
 from wrong_files import assert_refused
 
 from kcal import Camera, InputError
@@ -51,7 +51,7 @@ def camera(kind: str, amplitude: float = 2e-3) -> Camera:
     )
 
 
-@both
+@every
 def test_the_field_is_the_sum_of_its_columns(kind: str) -> None:
     modes, weights = KINDS[kind], draw((3, len(KINDS[kind])), 2)
     x, y = 0.5 * draw((2, 3, 7), 4)
@@ -81,10 +81,11 @@ def test_columns_in_memory_that_is_given(kind: str) -> None:
     assert torch.equal(memory[[0, -1]], kept[[0, -1]])
 
 
-@both
+@every
 def test_slopes_against_autograd(kind: str) -> None:
     modes, weights = KINDS[kind], draw((len(KINDS[kind]),), 2)
-    x, y = (0.5 * draw((2, 7), 5)).requires_grad_().unbind()
+    # The last place is the center.
+    x, y = (0.5 * draw((2, 7), 5) * (torch.arange(7) < 6)).requires_grad_().unbind()
     f, g, *slopes = modes.field(weights, x, y)
     wanted = [torch.autograd.grad(value.sum(), place, retain_graph=True)[0] for value in (f, g) for place in (x, y)]
     for found, true in zip(slopes, wanted, strict=True):
@@ -131,9 +132,8 @@ def test_state_and_compiled_graph(kind: str) -> None:
     assert blank.fingerprint == own.fingerprint
     rays, _ = own.unproject(own.grid(5, 4).reshape(-1, 2))
     torch.compiler.reset()
-    module = own
-    compiled = torch.compile(module, fullgraph=True, backend="eager", dynamic=True)
-    torch.testing.assert_close(compiled(rays)[0], module(rays)[0], rtol=0, atol=1e-9)
+    compiled = torch.compile(own, fullgraph=True, backend="eager", dynamic=True)
+    torch.testing.assert_close(compiled(rays)[0], own(rays)[0], rtol=0, atol=1e-9)
 
 
 @both
@@ -244,10 +244,7 @@ def test_orthogonal_with_mean_square_one() -> None:
 def test_turns_with_the_azimuth() -> None:
     """Rotating the place by an angle rotates the displacement by it, and m = j - 1 times more."""
     generator = torch.Generator().manual_seed(1)
-    radius, azimuth = (
-        0.9 * torch.rand(7, generator=generator).double(),
-        6.0 * torch.rand(7, generator=generator).double(),
-    )
+    radius, azimuth = (reach * torch.rand(7, generator=generator).double() for reach in (0.9, 6.0))
     turn = 0.7
     before = MODES.columns(radius * torch.cos(azimuth), radius * torch.sin(azimuth))
     after = MODES.columns(radius * torch.cos(azimuth + turn), radius * torch.sin(azimuth + turn))
@@ -284,34 +281,6 @@ def test_a_low_mode_written_out() -> None:
     x, y = torch.tensor([0.6], dtype=torch.float64), torch.tensor([0.3], dtype=torch.float64)
     column = MODES.columns(x, y)[MODES.names.index("z2+0")]
     torch.testing.assert_close(column, torch.tensor([[math.sqrt(3) * -0.1], [0.0]], dtype=torch.float64))
-
-
-@pytest.mark.parametrize("modes", [MODES, FEW, ZernikeModes(radial=5, decentered=0, astigmatic=0, other=0)])
-@pytest.mark.parametrize("lead", [(), (2,), (2, 3)])
-def test_field_is_the_sum_of_its_modes(modes: ZernikeModes, lead: tuple[int, ...]) -> None:
-    x, y, _ = disc(5, 9)
-    weights = torch.randn(*lead, len(modes), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    expected = torch.einsum("...m,mcn->c...n", weights, modes.columns(x, y))
-    scale = float(expected.abs().max())
-    f, g = modes.field(weights, x, y, slopes=False)
-    # The highest modes by powers of t cancel by five digits, and all have weight one here.
-    torch.testing.assert_close(torch.stack([f, g]), expected, rtol=0, atol=1e-11 * scale)
-    again = modes.field(weights, x, y)
-    assert torch.equal(torch.stack(again[:2]), torch.stack([f, g]))
-
-
-@pytest.mark.parametrize("modes", [MODES, FEW])
-def test_slopes(modes: ZernikeModes) -> None:
-    x, y, _ = disc(4, 5)
-    x, y = torch.cat([x, torch.zeros(1).double()]), torch.cat([y, torch.zeros(1).double()])
-    weights = torch.randn(len(modes), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-
-    def total(place: Tensor) -> Tensor:
-        return torch.stack([part.sum() for part in modes.field(weights, place[0], place[1], slopes=False)])
-
-    automatic = jacfwd(total)(torch.stack([x, y]))
-    closed = torch.stack(modes.field(weights, x, y)[2:]).unflatten(0, (2, 2))
-    torch.testing.assert_close(closed, automatic, rtol=1e-11, atol=1e-11)
 
 
 def test_inputs_and_weights_are_not_overwritten() -> None:
@@ -384,11 +353,6 @@ class TestRotation:
         # kornia adds 1e-6 to small angles in its own series; what is left must be far below a step that matters.
         torch.testing.assert_close(rotation_from_vector(w), torch.linalg.matrix_exp(cross(w)), rtol=0, atol=1e-12)
 
-    def test_is_a_rotation(self, length: float) -> None:
-        r = rotation_from_vector(length * axis(2))
-        torch.testing.assert_close(r @ r.T, torch.eye(3).double(), rtol=0, atol=1e-12)
-        assert float(torch.linalg.det(r)) == pytest.approx(1.0, abs=1e-12)
-
     def test_there_and_back(self, length: float) -> None:
         w = length * axis(3)
         back = vector_from_rotation(rotation_from_vector(w))
@@ -400,16 +364,9 @@ class TestRotation:
         derivative = torch.func.jacfwd(rotation_from_vector)(w)
         reverse = torch.func.jacrev(rotation_from_vector)(w)
         torch.testing.assert_close(derivative, reverse, rtol=0, atol=1e-12)
-        h = 1e-4
-        columns = []
-        for i in range(3):
-            e = torch.zeros(3, dtype=torch.float64)
-            e[i] = h
-            near = torch.linalg.matrix_exp(cross(w + e)) - torch.linalg.matrix_exp(cross(w - e))
-            far = torch.linalg.matrix_exp(cross(w + 2 * e)) - torch.linalg.matrix_exp(cross(w - 2 * e))
-            columns.append((8.0 * near - far) / (12.0 * h))
         # Fourth-order differences leave rounding over the step.
-        torch.testing.assert_close(derivative, torch.stack(columns, -1), rtol=0, atol=1e-10)
+        wanted = numeric(lambda v: torch.linalg.matrix_exp(cross(v)), w, 1e-4)
+        torch.testing.assert_close(derivative, wanted, rtol=0, atol=1e-10)
 
 
 def test_right_hand_rule() -> None:

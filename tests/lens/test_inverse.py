@@ -137,13 +137,6 @@ class TestFold:
         model="opencv8",
     )
 
-    def test_corners_without_preimage_are_flagged(self) -> None:
-        width, height = self.kornia.size
-        corners = torch.tensor([[0.0, 0.0], [0, height - 1], [width - 1, 0], [width - 1, height - 1]]).double()
-        assert check_round_trip(self.kornia, corners).tolist() == [False] * 4
-        sides = torch.tensor([[0.0, height / 2], [width / 2, 0.0], [width / 2, height / 2], [width - 1, height / 2]])
-        assert check_round_trip(self.kornia, sides.double()).tolist() == [True] * 4
-
     def test_flagged_exactly_where_no_preimage_is(self) -> None:
         """The image of the fold is the border: all pixels inside it are found, none outside."""
         camera = self.kornia

@@ -15,7 +15,7 @@ from torch.func import functional_call, stack_module_state, vmap
 
 from kcal import Camera, InputError, Localizer, Origin, Rig, load_camera, save_camera
 from kcal.io.rig_file import RigFile, load_rig, save_rig
-from kcal.lens import CameraRays, LensModel, Undistort, bake
+from kcal.lens import CameraRays, LensModel, Undistort, Unproject, bake
 from kcal.lens.model import HybridForm
 from kcal.nets import NetworkModes
 
@@ -100,7 +100,7 @@ def test_gradients_by_points_parameters_and_weights(kind: str) -> None:
 
     def with_state(inverse: bool, places: Tensor, *state: Tensor) -> Tensor:
         named = dict(zip(["params", *(f"field.{name}" for name in names)], state, strict=True))
-        function = _Unprojected(own) if inverse else own
+        function = Unproject(own) if inverse else own
         prefixed = {f"camera.{name}": value for name, value in named.items()} if inverse else named
         value: Tensor = functional_call(function, prefixed, (places,))[0]
         return value
@@ -111,15 +111,6 @@ def test_gradients_by_points_parameters_and_weights(kind: str) -> None:
         assert torch.autograd.gradcheck(lambda *v, i=inverse: with_state(i, *v), (at, *leaves), atol=1e-6, rtol=1e-5)
         gradients = torch.autograd.grad(with_state(inverse, at, *leaves).square().sum(), [at, *leaves])
         assert all(float(g.abs().max()) > 0 for g in gradients)
-
-
-class _Unprojected(nn.Module):
-    def __init__(self, camera: Camera) -> None:
-        super().__init__()
-        self.camera = camera
-
-    def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        return self.camera.unproject(pixels)
 
 
 @every

@@ -348,28 +348,6 @@ def test_border_goes_on_outside():
     assert torch.equal(grid[1:-1, 1:-1].reshape(-1, 3), board_points(BoardSize(3, 2, 0.5)))
 
 
-@pytest.mark.parametrize(
-    ("a", "b", "paper", "black"),
-    [
-        (-0.5, -0.5, 1, 1),  # diagonally outside corner 0
-        (0.5, -0.5, 1, 0),
-        (0.5, 0.5, 1, 1),
-        (8.5, -0.5, 1, 0),  # 10 x 7 squares: the top right one is white
-        (8.5, 5.5, 1, 0),
-        (-0.5, 5.5, 1, 1),
-        (-1.5, 0.5, 1, 0),  # the margin
-        (9.5, 2.5, 1, 0),
-        (-2.5, 0.5, 0, 0),  # beyond it
-        (3.0, 6.0 + 1.5, 0, 0),
-    ],
-)
-def test_colors_of_squares(a, b, paper, black):
-    a, b, width = (torch.tensor([value], dtype=torch.float64) for value in (a, b, 0.01))
-    colors = area_colors(a, b, width, width, BoardSize(9, 6, 1.0), 1)
-    assert float(colors.paper) == pytest.approx(paper, abs=1e-12)
-    assert float(colors.black) == pytest.approx(black, abs=1e-12)
-
-
 def test_area_averages_are_integrals():
     # Midpoint sums over boxes of any size, also many squares wide; n midpoints err by less than edges * width / n.
     generator = torch.Generator().manual_seed(3)
