@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -21,7 +20,7 @@ from kcal.lens.camera import Camera
 from kcal.sim.captures import board_points
 from scripts.shared.captures import PAPER_BOARD, capture_corners
 from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 from scripts.shared.traced import BOARD, as_observations
 from scripts.shared.views import TRUTH
@@ -67,7 +66,7 @@ def errors(camera: Camera, views: int, noise: float, seed: int, model: str) -> l
 
 
 @section("one-camera.md", "exact-models", seeds=range(200, 201), views=(8,))
-def exact_models(seeds: range = range(200, 204), views: tuple[int, ...] = VIEWS) -> Iterator[str]:
+def exact_models(seeds: range = range(200, 204), views: tuple[int, ...] = VIEWS) -> Lines:
     rows, ratios = [], []
     for model, count, noise in itertools.product(MODELS, views, NOISE):
         found = [errors(drawn(model, seed), count, noise, 1000 + seed, model) for seed in seeds]
@@ -80,4 +79,3 @@ def exact_models(seeds: range = range(200, 204), views: tuple[int, ...] = VIEWS)
     )
     yield f"Default camera over the right model: {unknown}; both with the board taken as exact: {exact}."
     yield ""
-    yield from table(["the lens is", "views", "noise", "default camera", "right model, warp", "ratio"], rows)

@@ -7,7 +7,6 @@ faster. The statistics are simulations with fixed seeds and do not depend on the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -25,7 +24,7 @@ from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.localizer import Localizer
 from kcal.locate.tabulate import circular_error
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 from scripts.shared.timing import median, ratio, times
 
@@ -58,13 +57,16 @@ def sides(points: Tensor, sigma: float) -> Tensor:
 
 @section("locate.md", "triangulation", rounds=1, points=COUNTS[:1])
 @torch.no_grad()
-def triangulation(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[str]:
+def triangulation(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Lines:
     cameras = poses()
     pose = cameras[1, :, :3].contiguous(), cameras[1, :, 3].contiguous()
     P = cameras.numpy()
     torch.compiler.reset()
     compiled = torch.compile(triangulate_pairs, fullgraph=True, dynamic=True)
-    rows = []
+    yield [
+        "points", "kcal closed form", "kcal compiled", "OpenCV", "kornia eigh", "kornia cofactor", "closed / OpenCV",
+        "closed / cofactor",
+    ]  # fmt: skip
     for count in points:
         flat = sides(some_points(count), 0.1)
         rays = torch.cat([flat, torch.ones(count, 2, 1, dtype=torch.float64)], -1)
@@ -80,18 +82,16 @@ def triangulation(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterato
         ]
         found = times(calls, rounds)
         rate = [median([1e-6 * count / s for s in side], 2) for side in found]
-        rows.append([f"{count:.0e}", *rate, ratio(found[0], found[2]), ratio(found[0], found[4])])
-    heads = ["points", "kcal closed form", "kcal compiled", "OpenCV", "kornia eigh", "kornia cofactor"]
-    return table([*heads, "closed / OpenCV", "closed / cofactor"], rows)
+        yield [f"{count:.0e}", *rate, ratio(found[0], found[2]), ratio(found[0], found[4])]
 
 
 @section("locate.md", "accuracy")
 @torch.no_grad()
-def accuracy(count: int = 100_000) -> Iterator[str]:
+def accuracy(count: int = 100_000) -> Lines:
     cameras = poses()
     P = cameras.numpy()
     point = torch.tensor([[300.0, -100.0, 5000.0]], dtype=torch.float64).expand(count, 3)
-    rows = []
+    yield ["at 5 km", "kcal closed form", "kcal singular values", "OpenCV", "kornia eigh", "kornia cofactor"]
     for name, sigma in (("0.1 px of noise: RMS error, m", 0.1), ("no noise: largest error, m", 0.0)):
         flat = sides(point, sigma)
         rays = torch.cat([flat, torch.ones(count, 2, 1, dtype=torch.float64)], -1)
@@ -106,9 +106,7 @@ def accuracy(count: int = 100_000) -> Iterator[str]:
         ]
         errors = [torch.linalg.vector_norm(each - point, dim=-1) for each in found]
         cells = [f"{float(e.square().mean().sqrt()):.4f}" if sigma else f"{float(e.max()):.1e}" for e in errors]
-        rows.append([name, *cells])
-    heads = ["at 5 km", "kcal closed form", "kcal singular values", "OpenCV", "kornia eigh", "kornia cofactor"]
-    yield from table(heads, rows)
+        yield [name, *cells]
     yield from ["", geodesy()]
 
 
@@ -121,12 +119,12 @@ def known_to() -> RigCovariance:
 
 @section("locate.md", "localizer", rounds=1, points=COUNTS[:1])
 @torch.no_grad()
-def localizer(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[str]:
+def localizer(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Lines:
     plain = Localizer(rig().placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
     wide = rig()
     wide.covariance = known_to()
     known = Localizer(wide.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
-    rows = []
+    yield ["points", "marks' noise given once", "a 4x4 covariance a point", "with the calibration's covariance"]
     for count in points:
         left, right = rig()(some_points(count))[0].unbind(-2)
         cov = (0.01 * torch.eye(4, dtype=torch.float64)).expand(count, 4, 4)
@@ -135,21 +133,22 @@ def localizer(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[st
             rounds,
         )
         rate = [median([1e-6 * count / s for s in side], 3) for side in found]
-        rows.append([f"{count:.0e}", *rate])
-    heads = ["points", "marks' noise given once", "a 4x4 covariance a point", "with the calibration's covariance"]
-    return table(heads, rows)
+        yield [f"{count:.0e}", *rate]
 
 
 @section("locate.md", "coverage", draws=400)
 @torch.no_grad()
-def coverage(draws: int = 40_000) -> Iterator[str]:
+def coverage(draws: int = 40_000) -> Lines:
     """Simulated marks, and rigs drawn from their own covariance, at seven ranges."""
     there, known = rig(), known_to()
     plain = Localizer(there.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
     there.covariance = known
     wide = Localizer(there.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
     factor, generator = known.half.T, torch.Generator().manual_seed(7)
-    rows = []
+    yield [
+        "range, m", "marks only: interval", "CEP50", "CEP95", "RMS of range / bound", "with calibration: interval",
+        "interval of marks alone, same rigs",
+    ]  # fmt: skip
     for i, distance in enumerate(RANGES):
         angle = -0.3 + 0.1 * i
         point = distance * torch.tensor([[math.sin(angle), 0.02 * i - 0.06, math.cos(angle)]], dtype=torch.float64)
@@ -173,13 +172,11 @@ def coverage(draws: int = 40_000) -> Iterator[str]:
         for module in (wide, plain):
             answer = module(noisy[:, :2], noisy[:, 2:])
             shares.append(((answer.range_low <= distance) & (distance <= answer.range_high)).double().mean().item())
-        rows.append([
+        yield [
             f"{distance:.0f}", f"{100 * inside.double().mean().item():.2f} %",
             *(f"{100 * share:.1f} %" for share in circles), f"{range_rms / bound:.3f}",
             *(f"{100 * share:.2f} %" for share in shares),
-        ])  # fmt: skip
-    heads = ["range, m", "marks only: interval", "CEP50", "CEP95", "RMS of range / bound"]
-    return table([*heads, "with calibration: interval", "interval of marks alone, same rigs"], rows)
+        ]  # fmt: skip
 
 
 def _marks_of_drawn_rigs(there: Rig, point: Tensor, factor: Tensor, draws: int, generator: torch.Generator) -> Tensor:

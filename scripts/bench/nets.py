@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 from unittest import mock
 
@@ -25,7 +25,7 @@ from kcal.lens.zernike import ZernikeModes
 from kcal.nets import train_inverse
 from scripts.bench.lens import LENS, SIZE
 from scripts.bench.lens import build as build_hd
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 from scripts.shared.timing import ratio, times
 
@@ -82,9 +82,9 @@ def evaluations(camera: Camera, pixels: Tensor, start: InverseStart | None) -> i
 
 @section("lens.md", "inverse nets", rounds=1, cameras=("opencv5",))
 @torch.no_grad()
-def inverse_nets(rounds: int = 15, cameras: tuple[str, ...] = tuple(CAMERAS)) -> Iterator[str]:
+def inverse_nets(rounds: int = 15, cameras: tuple[str, ...] = tuple(CAMERAS)) -> Lines:
     """Evaluations and time of `unproject` with and without a net."""
-    rows = []
+    yield ["camera", "evaluations of the lens a call", "with the net", "time with / without"]
     for name in cameras:
         camera = CAMERAS[name]()
         guess = train_inverse(camera).net.guess
@@ -94,14 +94,16 @@ def inverse_nets(rounds: int = 15, cameras: tuple[str, ...] = tuple(CAMERAS)) ->
         assert float((plain[0] - helped[0]).abs().max()) < 1e-6
         found = times([lambda: camera.unproject(pixels), lambda: camera.unproject(pixels, start=guess)], rounds)  # noqa: B023
         saved = (evaluations(camera, pixels, start) for start in (None, guess))
-        rows.append([name, *saved, ratio(found[1], found[0])])
-    return table(["camera", "evaluations of the lens a call", "with the net", "time with / without"], rows)
+        yield [name, *saved, ratio(found[1], found[0])]
 
 
 @section("lens.md", "lookup tables", rounds=1, cameras=("opencv5",))
 @torch.no_grad()
-def lookup_tables(rounds: int = 15, cameras: tuple[str, ...] = tuple(CAMERAS)) -> Iterator[str]:
-    rows = []
+def lookup_tables(rounds: int = 15, cameras: tuple[str, ...] = tuple(CAMERAS)) -> Lines:
+    yield [
+        "camera", "tolerance, px", "baking, s", "file, kB", "bound, px", "largest error found, px", "answers for",
+        "project: table / camera", "unproject: table / camera",
+    ]  # fmt: skip
     for name in cameras:
         camera = CAMERAS[name]()
         pixels = random_pixels(camera, 10 * POINTS)
@@ -124,10 +126,8 @@ def lookup_tables(rounds: int = 15, cameras: tuple[str, ...] = tuple(CAMERAS)) -
             found = times(calls, rounds)
             buffer = io.BytesIO()
             np.savez(buffer, **{key: value.numpy() for key, value in lookup.state_dict().items()})
-            rows.append([
+            yield [
                 name, f"{tolerance:.0e}", f"{seconds:.1f}", round(len(buffer.getvalue()) / 1000),
                 f"{max(lookup.bound):.1e}", f"{largest:.1e}", f"{100 * min(lookup.coverage):.1f} %",
                 ratio(found[1], found[0]), ratio(found[3], found[2]),
-            ])  # fmt: skip
-    heads = ["camera", "tolerance, px", "baking, s", "file, kB", "bound, px", "largest error found, px", "answers for"]
-    return table([*heads, "project: table / camera", "unproject: table / camera"], rows)
+            ]  # fmt: skip

@@ -32,7 +32,7 @@ from kcal.locate.siting import Site, area_of, rank_sites, siting_map
 from kcal.rig import planned_rig
 from scripts.shared.children import interpreter
 from scripts.shared.memory import peak_megabytes
-from scripts.shared.page import DOCS, table
+from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.sections import section
 from scripts.shared.station_scenes import drawn_errors, hills, marks, ring, targets
 from scripts.shared.timing import children_seconds, show
@@ -93,7 +93,7 @@ def sites(cells: int = 200, write: bool = False) -> Iterator[str]:
 
 
 @section("stations.md", "frame", rounds=1)
-def frame(rounds: int = 20) -> Iterator[str]:
+def frame(rounds: int = 20) -> Lines:
     """Milliseconds of 1,000 detections in 8 cameras."""
     rig, generator = ring(8, 5000.0), torch.Generator().manual_seed(0)
     root = rig.with_errors(position_m=0.3, attitude_deg=(0.004, 0.004, 0.02), refraction=0.1)
@@ -102,7 +102,7 @@ def frame(rounds: int = 20) -> Iterator[str]:
     spoiled = seen.clone()
     spoiled[torch.rand(1000, 8, generator=generator) < 0.1] = math.nan
     spoiled[torch.rand(1000, 8, generator=generator) < 0.05] += 60.0
-    rows = []
+    yield ["marks", "errors", "CPU ms a frame"]
     for name, pixels in (("all seen, none wrong", seen), ("10 % missing, 5 % wrong", spoiled)):
         for errors, known in (("marks alone", torch.zeros(1, rig.quantities).double()), ("all errors", root)):
             localize = Localizer(rig, root=known, pixel_sigma=0.3)
@@ -112,14 +112,14 @@ def frame(rounds: int = 20) -> Iterator[str]:
                     start = time.process_time()
                     localize(pixels)
                     spent.append(time.process_time() - start)
-            rows.append([name, errors, f"{1e3 * float(np.median(spent[1:])):.0f}"])
-    return table(["marks", "errors", "CPU ms a frame"], rows)
+            yield [name, errors, f"{1e3 * float(np.median(spent[1:])):.0f}"]
 
 
 @section("stations.md", "two", pairs=1000)
-def two(pairs: int = 200_000) -> Iterator[str]:
+def two(pairs: int = 200_000) -> Lines:
     """Two ways to weigh two cameras, on the same pairs of marks."""
-    rows, generator = [], torch.Generator().manual_seed(0)
+    yield ["errors", "weights by marks, CPU s per million", "by all errors", "times", "median difference in σ"]
+    generator = torch.Generator().manual_seed(0)
     for name, pose in (("marks alone", None), ("and lenses and pose", 1e-10 * torch.eye(6).double())):
         rig = planned_rig()
         rig.mounting = Mounting(origin=Origin(lat=45.0, lon=6.0, height=800.0), heading_deg=35.0, pitch_deg=-1.0)
@@ -139,14 +139,10 @@ def two(pairs: int = 200_000) -> Iterator[str]:
         sigma = ours.covariance[both].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
         off = (ours.enu - theirs.enu)[both].norm(dim=-1) / sigma
         each = 1e6 / pairs
-        rows.append([
+        yield [
             name, f"{by_pair * each:.2f}", f"{by_views * each:.1f}", f"{by_views / by_pair:.1f}",
             f"{float(off.median()):.1e}",
-        ])  # fmt: skip
-    return table(
-        ["errors", "weights by marks, CPU s per million", "by all errors", "times", "median difference in σ"],
-        rows,
-    )
+        ]  # fmt: skip
 
 
 def _timed(localize: torch.nn.Module, *marked: Tensor) -> tuple[Any, float]:
@@ -157,9 +153,10 @@ def _timed(localize: torch.nn.Module, *marked: Tensor) -> tuple[Any, float]:
 
 
 @section("stations.md", "table", sizes=(300,))
-def long_tables(sizes: tuple[int, ...] = (100_000, 1_000_000)) -> Iterator[str]:
+def long_tables(sizes: tuple[int, ...] = (100_000, 1_000_000)) -> Lines:
     """CPU seconds and peak memory of `kcal locate` of marks of three cameras, in a process of its own."""
-    rig, rows = ring(3, 5000.0), []
+    yield ["lines", "positions", "CPU s", "peak MB"]
+    rig = ring(3, 5000.0)
     rig.root = rig.with_errors(attitude_deg=0.01)
     for size in sizes:
         with tempfile.TemporaryDirectory() as folder:
@@ -183,8 +180,7 @@ def long_tables(sizes: tuple[int, ...] = (100_000, 1_000_000)) -> Iterator[str]:
             peak = float(done.stderr.split("peak ")[-1])
             with Path(folder, "out.csv").open() as file:
                 lines = sum(1 for _ in file) - 1
-            rows.append([f"{3 * things:,}", f"{lines:,}", f"{spent:.0f}", f"{peak:.0f}"])
-    return table(["lines", "positions", "CPU s", "peak MB"], rows)
+            yield [f"{3 * things:,}", f"{lines:,}", f"{spent:.0f}", f"{peak:.0f}"]
 
 
 @section("stations.md", "many", sizes=(2, 4))

@@ -43,7 +43,7 @@ from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, sample_board_poses
 from scripts.shared.moving_captures import Hands, MovingCapture, draw_motion, moving_capture
-from scripts.shared.page import merged, table
+from scripts.shared.page import Lines, merged
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import against_truth, bends, simulated, view_of
 from scripts.shared.timing import rms, share
@@ -239,9 +239,9 @@ def moving_lines(records: list[Record]) -> Iterator[str]:
     return merged("ordinary.md", "moving", head, rows)
 
 
-def rig_lines(records: list[Record]) -> Iterator[str]:
+def rig_lines(records: list[Record]) -> Lines:
     """One row for boards by hand and on a stand, with and without motion."""
-    rows = []
+    yield ["held by", "fit", "rigs", "refused", "χ²/6", "in 95 %", "RMS error of rotation, mrad", "of position, mm"]
     for held_by, fit in itertools.product(("hand", "stand"), ("default", "still")):
         own = [record for record in records if (record["key"][0], record["key"][2]) == (held_by, fit)]
         known = [record for record in own if "refused" not in record]
@@ -250,11 +250,7 @@ def rig_lines(records: list[Record]) -> Iterator[str]:
             mean = statistics.fmean(record["chi2"] / 6 for record in known)
             errors = [rms([record[key] for record in known]) for key in ("mrad", "mm")]
             refused = len(own) - len(known)
-            rows.append(
-                [held_by, fit, len(own), refused, f"{mean:.2f}", f"{inside:.0f} %", *(f"{e:.3f}" for e in errors)]
-            )
-    head = ["held by", "fit", "rigs", "refused", "χ²/6", "in 95 %", "RMS error of rotation, mrad", "of position, mm"]
-    return table(head, rows)
+            yield [held_by, fit, len(own), refused, f"{mean:.2f}", f"{inside:.0f} %", *(f"{e:.3f}" for e in errors)]
 
 
 def captures_of(

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from kcal.files import make_folder
 from scripts.check.cpus_figures import Row, compare
-from scripts.shared.page import DOCS, table
+from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.sections import section
 from scripts.shared.timing import show
 
@@ -126,7 +126,7 @@ def figures(
         yield from _figures(make_folder(folder or Path(name)), settings, cameras)
 
 
-def _figures(folder: Path, settings: tuple[str, ...], cameras: tuple[str, ...]) -> Iterator[str]:
+def _figures(folder: Path, settings: tuple[str, ...], cameras: tuple[str, ...]) -> Lines:
     places = {setting: folder / str(i) for i, setting in enumerate(settings)}
     first, *others = places
     for setting, place in places.items():
@@ -139,14 +139,13 @@ def _figures(folder: Path, settings: tuple[str, ...], cameras: tuple[str, ...]) 
         name, _, model = stage.rpartition(", ")
         kind = f"cameras, {model}" if name else "rigs" if stage.startswith("rig ") else stage
         kinds.setdefault(kind, {})[name or stage] = found
-    rows = []
+    yield ["stage", "number", "largest difference / σ", "of σ itself", "where", "status"]
     for kind, stages in kinds.items():
         where, (away, _, setting, _) = max(stages.items(), key=lambda item: max(item[1][0], default=0.0))
         sigma = [value for _, values, _, _ in stages.values() for value in values]
         notes = "; ".join(f"{stage}: {note}" for stage, (*_, note) in stages.items() if note)
         largest = (f"{max(values):.0e}" if values else "" for values in (away, sigma))
-        rows.append([kind, len(stages), *largest, f"{where}, {setting}", notes])
-    return table(["stage", "number", "largest difference / σ", "of σ itself", "where", "status"], rows)
+        yield [kind, len(stages), *largest, f"{where}, {setting}", notes]
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ from kcal import Baseline, KcalError, Landmarks, Observations, RigData, calibrat
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens import vector_from_rotation
 from scripts.check.rig import BASELINE, NAMES, STRAIGHT, TRUTH, data, generator, landmarks
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 from scripts.shared.real_captures import load, names
 from scripts.shared.sections import section
 from scripts.shared.simulated import simulated
@@ -175,7 +175,7 @@ def rightly(text: str, seen: Observations, second: set[int]) -> float:
 
 
 @section("ordinary.md", "two cameras", seeds=range(1), views=8, simulated_only=True)
-def of_captures(seeds: range = range(4), views: int = 20, simulated_only: bool = False) -> Iterator[str]:
+def of_captures(seeds: range = range(4), views: int = 20, simulated_only: bool = False) -> Lines:
     found: dict[str, list[float | None]] = {}
     for kind, seen, second in itertools.chain(captures(seeds, views), () if simulated_only else real_captures()):
         share: float | None = None
@@ -184,9 +184,8 @@ def of_captures(seeds: range = range(4), views: int = 20, simulated_only: bool =
         except KcalError as error:
             share = rightly(str(error), seen, second)
         found.setdefault(kind, []).append(share)
-    rows = []
+    yield ["captures", "refused", "rightly named"]
     for kind, shares in found.items():
         told = [share for share in shares if share is not None]
         mean = f"{sum(told) / len(told):.2f}" if told and "good" not in kind else "–"
-        rows.append([kind, f"{len(told)}/{len(shares)}", mean])
-    return table(["captures", "refused", "rightly named"], rows)
+        yield [kind, f"{len(told)}/{len(shares)}", mean]

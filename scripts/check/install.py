@@ -15,13 +15,13 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from scripts.shared.page import DOCS, table
+from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.sections import section
 from scripts.shared.timing import children_seconds
 
@@ -121,7 +121,7 @@ def opencv_packages(
         "opencv-python==4.12.0.88",
     ),
     images: int = 13,
-) -> Iterator[str]:
+) -> Lines:
     """Corners of OpenCV's sample images with other packages of OpenCV, against those with kcal's own."""
     if "KCAL_DATA" not in os.environ:
         raise SystemExit("KCAL_DATA names no folder of captures")
@@ -138,7 +138,8 @@ def opencv_packages(
             raise SystemExit(done.stderr[-1000:])
         return json.loads(done.stdout)
 
-    (_, own), rows = corners(str(ROOT)), []
+    yield ["package", "version", "corners", "largest difference, px"]
+    _, own = corners(str(ROOT))
     for package in packages:
         with tempfile.TemporaryDirectory() as folder:
             subprocess.run(
@@ -149,5 +150,4 @@ def opencv_packages(
             assert package.partition("==")[2].startswith(used), used
         far = max(abs(a - b) for one, other in zip(own, found, strict=True) for p, q in zip(one, other, strict=True)
                   for a, b in zip(p, q, strict=True))  # fmt: skip
-        rows.append([*package.split("=="), sum(map(len, found)), f"{far:.1g}"])
-    return table(["package", "version", "corners", "largest difference, px"], rows)
+        yield [*package.split("=="), sum(map(len, found)), f"{far:.1g}"]

@@ -29,7 +29,7 @@ import math
 import pkgutil
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, NamedTuple
@@ -39,7 +39,7 @@ import pytest
 from scripts.check.harmless import HARMLESS
 from scripts.check.mutations import Site, sites
 from scripts.check.traced_tests import FILE, ROOT, First, apart, observed, run_tests
-from scripts.shared.page import read_section, table
+from scripts.shared.page import Lines, laid_out, read_section, table
 from scripts.shared.sections import section
 from scripts.shared.timing import show
 
@@ -301,14 +301,13 @@ def report() -> tuple[list[str], list[str]]:
     return [*table(heads, rows), "", summary], lines
 
 
-def time_table(rooms: Sequence[str]) -> Iterator[str]:
+def time_table(rooms: Sequence[str]) -> Lines:
     """Processor time of each room's tests, and the tests that take longest."""
-    rows = []
+    yield ["room", "tests", "CPU s", "those of 2 s and more"]
     for room in rooms:
         tests = sorted(((s, name) for file in observe(room, -math.inf) for name, s in file["seconds"].items()))[::-1]
         longest = ", ".join(f"{name.split('/')[-1]} {seconds:.0f}" for seconds, name in tests[:6] if seconds >= 2)
-        rows.append((f"`{room}`", len(tests), f"{sum(seconds for seconds, _ in tests):.0f}", longest))
-    return table(("room", "tests", "CPU s", "those of 2 s and more"), rows)
+        yield (f"`{room}`", len(tests), f"{sum(seconds for seconds, _ in tests):.0f}", longest)
 
 
 @section("mutants.md", "mutants", seconds=0.0, rooms=("web",))
@@ -317,7 +316,7 @@ def mutants(
     again: bool = False, times: bool = False,
 ) -> list[str]:  # fmt: skip
     if times:
-        show(list(time_table(rooms)))
+        show(list(laid_out(time_table(rooms))))
         return []
     STATE.mkdir(exist_ok=True)
     stop = time.monotonic() + seconds

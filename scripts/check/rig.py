@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -21,7 +20,7 @@ from kcal.report import rig_figure, save_picture
 from kcal.rig import RigCovariance
 from kcal.watch.turned import drift_of_turns, measure_drift
 from scripts.shared.long_range import ORIGIN, RANGES, matches_of, rig
-from scripts.shared.page import DOCS, table
+from scripts.shared.page import DOCS, Lines
 from scripts.shared.sections import section
 from scripts.shared.timing import rms, share
 
@@ -126,7 +125,7 @@ def yaw_error(found: RigResult) -> float:
 
 @section("rig.md", "coverage", draws=2)
 @torch.no_grad()
-def coverage(draws: int = 100, marks: int = 50) -> Iterator[str]:
+def coverage(draws: int = 100, marks: int = 50) -> Lines:
     """Rigs solved anew, and targets marked with them."""
     angles = torch.tensor([-0.3 + 0.1 * i for i in range(len(RANGES))], dtype=torch.float64)
     far = torch.tensor(RANGES, dtype=torch.float64)
@@ -135,7 +134,10 @@ def coverage(draws: int = 100, marks: int = 50) -> Iterator[str]:
     exact = seen(targets)
     best = Localizer(TRUTH.placed(origin=ORIGIN, heading_deg=HEADING), pixel_sigma=MARK)(exact[:, 0], exact[:, 1])
     bound = best.inverse_range_sigma
-    rows = []
+    yield [
+        f"from {len(landmarks(generator(0)).names)} landmarks and", "σ of yaw", "its error / σ",
+        *(f"{distance:g} m" for distance in RANGES),
+    ]  # fmt: skip
     for kind in (
         "nothing else",
         "a baseline ± 5 mm",
@@ -162,16 +164,17 @@ def coverage(draws: int = 100, marks: int = 50) -> Iterator[str]:
             f"{share(each, ' %')}; {float(price):.2f}"
             for each, price in zip(torch.stack(inside).T.tolist(), ratio, strict=True)
         ]
-        rows.append([kind, f"{sum(sigmas) / draws:.5f}°", f"{scatter:.2f}", *cells])
-    heads = [f"from {len(landmarks(generator(0)).names)} landmarks and", "σ of yaw", "its error / σ"]
-    return table([*heads, *(f"{distance:g} m" for distance in RANGES)], rows)
+        yield [kind, f"{sum(sigmas) / draws:.5f}°", f"{scatter:.2f}", *cells]
 
 
 @section("rig.md", "wrong landmark", draws=1)
 @torch.no_grad()
-def wrong(draws: int = 50) -> Iterator[str]:
+def wrong(draws: int = 50) -> Lines:
     """One landmark of twelve is wrong."""
-    rows = []
+    yield [
+        "wrong by", "named and left out", "good ones left out, a rig", "RMS error of yaw, all kept",
+        "wrong one left out", "never wrong",
+    ]  # fmt: skip
     for kind, size in (("mark", 0.5), ("mark", 1.0), ("mark", 2.0), ("mark", 5.0), ("height", 1.0), ("height", 5.0)):
         named, false = 0, 0
         errors: list[list[float]] = [[], [], []]
@@ -193,9 +196,7 @@ def wrong(draws: int = 50) -> Iterator[str]:
             errors[2].append(yaw_error(solve_rig(good, STRAIGHT)))
         label = f"{size:g} px in one image" if kind == "mark" else f"{size:g} m of height"
         cells = [f"{rms(each):.5f}°" for each in errors]
-        rows.append([label, f"{100 * named / draws:.0f} %", f"{false / draws:.3f}", *cells])
-    heads = ["wrong by", "named and left out", "good ones left out, a rig", "RMS error of yaw, all kept"]
-    return table([*heads, "wrong one left out", "never wrong"], rows)
+        yield [label, f"{100 * named / draws:.0f} %", f"{false / draws:.3f}", *cells]
 
 
 @torch.no_grad()
@@ -206,9 +207,12 @@ def found_at_5_km(old: Rig, new: Rig) -> float:
 
 
 @section("rig.md", "turned", draws=2)
-def drift(draws: int = 50) -> Iterator[str]:
+def drift(draws: int = 50) -> Lines:
     """The right camera turns by 0.01°; points that do not move, then and now, or landmarks."""
-    rows = []
+    yield [
+        "seen", "RMS error of the yaw", "mean σ", "within 0.001°", "called significant", "the same without drift",
+        "5 km with the old rig", "RMS at 5 km, corrected",
+    ]  # fmt: skip
     yaw = math.radians(0.01)
     still = torch.zeros(2, 3, dtype=torch.float64)
     turned = torch.tensor([[0.0, 0.0, 0.0], [0.0, yaw, 0.0]], dtype=torch.float64)
@@ -250,13 +254,11 @@ def drift(draws: int = 50) -> Iterator[str]:
             after.append(found_at_5_km(corrected, later) - 5000.0)
             false += check(count, still, seed + draws, images)[2]
         within = sum(abs(e) < 0.001 for e in errors) / draws
-        rows.append([
+        yield [
             label, f"{rms(errors):.5f}°", f"{sum(sigmas) / draws:.5f}°", f"{100 * within:.0f} %",
             f"{100 * significant / draws:.0f} %", f"{100 * false / draws:.1f} %", f"{before:+.0f} m",
             f"{rms(after):.0f} m",
-        ])  # fmt: skip
-    heads = ["seen", "RMS error of the yaw", "mean σ", "within 0.001°", "called significant", "the same without drift"]
-    return table([*heads, "5 km with the old rig", "RMS at 5 km, corrected"], rows)
+        ]  # fmt: skip
 
 
 @section("rig.md", "picture")

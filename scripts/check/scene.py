@@ -41,7 +41,7 @@ from kcal.sim.captures import TrueRig, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM
 from scripts.shared.long_range import ORIGIN, matches_of
-from scripts.shared.page import DOCS, table
+from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.terrain import Terrain, Weather
 from scripts.shared.timing import share
@@ -321,7 +321,7 @@ BLOCK = 120.0  # px
 
 @section("scene.md", "common", moments=1)
 @torch.no_grad()
-def common(moments: int = 6) -> Iterator[str]:
+def common(moments: int = 6) -> Lines:
     """Whether means of errors over parts of the image are as large as stated, with and without what matches share.
 
     The scene stands still, and pairs differ by noise alone and by vehicles. Each part's weighted mean of
@@ -330,7 +330,7 @@ def common(moments: int = 6) -> Iterator[str]:
     terrain = Terrain(rig_of(HALF), 2)
     pairs = [photographed(terrain, moment) for moment in range(moments)]
     found = [match_scene(exact(HALF), pair) for pair in pairs]
-    rows = []
+    yield ["pairs", "parts of the image", "as independent: RMS over σ", "inside 95 %", "RMS over σ", "inside 95 %"]
     for count in [number for number in (1, 3, 6) if number <= moments]:
         z: tuple[list[float], list[float]] = [], []
         for first in range(0, moments + 1 - count, count):
@@ -353,10 +353,7 @@ def common(moments: int = 6) -> Iterator[str]:
         cells = [f"{count}", f"{len(z[0])}"]
         for values in map(np.array, z):
             cells += [f"{np.sqrt(np.square(values).mean()):.2f}", f"{100 * (np.abs(values) < 1.96).mean():.0f} %"]
-        rows.append(cells)
-    return table(
-        ("pairs", "parts of the image", "as independent: RMS over σ", "inside 95 %", "RMS over σ", "inside 95 %"), rows
-    )
+        yield cells
 
 
 def landmarks(draw: torch.Generator) -> Landmarks:

@@ -26,7 +26,7 @@ from kcal.stars.detect import detect_stars, read_night, time_of
 from kcal.stars.lens import StarCamera, calibrate_by_stars
 from kcal.stars.night import SkyView, fit_attitude, name_stars
 from kcal.stars.sky import StarCatalog, identify
-from scripts.shared.page import merged, table
+from scripts.shared.page import Lines, merged, table
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import NOT_KEPT, Kept, section
 from scripts.shared.star_lenses import lens_trials
@@ -155,10 +155,13 @@ def rig_trial(case: str, seed: int) -> dict[str, Any]:
 
 
 @section("stars.md", "rigs", seeds=range(1), cases=tuple(CASES)[1:2])
-def rigs(kept: Kept = NOT_KEPT, seeds: range = range(30), cases: tuple[str, ...] = tuple(CASES)) -> Iterator[str]:
+def rigs(kept: Kept = NOT_KEPT, seeds: range = range(30), cases: tuple[str, ...] = tuple(CASES)) -> Lines:
     """Ranges of rigs behind traced lenses that boards calibrated: errors, and coverage of their 95 % intervals."""
     records = kept.records(itertools.product(cases, seeds), rig_trial, lambda _: "done")
-    rows = []
+    yield [
+        "rig from a taped baseline and", "σ, % of range at 1, 2, 5 km", "RMS error", "error over σ",
+        "truth in the rig's 95 %", "with marks by day ± 0.1 px",
+    ]  # fmt: skip
     for name in cases:
         mean = np.mean([one["squares"] for one in records if one["key"][0] == name], axis=0)
         parts = (
@@ -166,9 +169,7 @@ def rigs(kept: Kept = NOT_KEPT, seeds: range = range(30), cases: tuple[str, ...]
             (mean[:, 2], 100, 0), (mean[:, 3], 100, 0),
         )  # fmt: skip
         cells = [" / ".join(f"{factor * v:.{digits}f}" for v in values) for values, factor, digits in parts]
-        rows.append([name, *cells])
-    heads = ["rig from a taped baseline and", "σ, % of range at 1, 2, 5 km", "RMS error", "error over σ"]
-    return table([*heads, "truth in the rig's 95 %", "with marks by day ± 0.1 px"], rows)
+        yield [name, *cells]
 
 
 def lens_trial(_: str, *of: int) -> dict[str, Any]:
@@ -176,15 +177,16 @@ def lens_trial(_: str, *of: int) -> dict[str, Any]:
 
 
 @section("stars.md", "lens", seeds=range(2, 3), boards=5, images=2)
-def lens(kept: Kept = NOT_KEPT, seeds: range = range(6), boards: int = 20, images: int = 20) -> Iterator[str]:
+def lens(kept: Kept = NOT_KEPT, seeds: range = range(6), boards: int = 20, images: int = 20) -> Lines:
     """A lens from boards, stars, and both, against the traced one at infinity; level and tilted by 30°."""
     records = kept.records([("lens", seed, boards, images) for seed in seeds], lens_trial, lambda _: "done")
-    rows = []
+    yield [
+        "from", "error at infinity, px: median of the RMS", "largest RMS", "largest anywhere", "inside 95 %",
+        "χ² of boards against stars, over its freedom", "contradictions",
+    ]  # fmt: skip
     for name in [name for name in records[0] if name != "key"]:
         trials = [one[name] for one in records if name in one]
         error, largest, inside, chi2, contradiction = (np.array(column) for column in zip(*trials, strict=True))
         told = [f"{chi2.mean():.2f}", contradiction.sum()] if np.isfinite(chi2).all() else ["", ""]
         shown = [f"{np.median(error):.4f}", f"{error.max():.4f}", f"{largest.max():.3f}"]
-        rows.append([name, *shown, f"{100 * inside.mean():.1f} %", *told])
-    heads = ["from", "error at infinity, px: median of the RMS", "largest RMS", "largest anywhere", "inside 95 %"]
-    return table([*heads, "χ² of boards against stars, over its freedom", "contradictions"], rows)
+        yield [name, *shown, f"{100 * inside.mean():.1f} %", *told]

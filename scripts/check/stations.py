@@ -31,7 +31,7 @@ from torch import Tensor
 from kcal import Camera, Localizer, Rig
 from kcal.locate.stereo import Localization, PositionStatus
 from kcal.locate.views import fit_views
-from scripts.shared.page import DOCS, table
+from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import section
 from scripts.shared.station_scenes import drawn_errors, marks, ring, targets
@@ -148,9 +148,9 @@ def peers_of(rig: Rig) -> dict[str, tuple[Solve, int]]:
 
 @section("stations.md", "peers", count=200)
 @torch.no_grad()
-def peers(count: int = 20_000) -> Iterator[str]:
+def peers(count: int = 20_000) -> Lines:
     """Table of errors and times."""
-    rows = []
+    yield ["views", "missing", "wrong", "program", "median mm", "95 % mm", "no position", "CPU s per million"]
     for views, missing, wrong in (
         (2, 0.0, 0.0), (4, 0.0, 0.0), (8, 0.0, 0.0), (4, 0.1, 0.05), (8, 0.0, 0.05), (8, 0.1, 0.05), (8, 0.4, 0.05),
     ):  # fmt: skip
@@ -170,12 +170,8 @@ def peers(count: int = 20_000) -> Iterator[str]:
             error = 1e3 * np.linalg.norm(result - cloud.numpy()[: len(some)], axis=1)
             none = ~np.isfinite(error)
             middle, high = np.quantile(error[~none], [0.5, 0.95])
-            rows.append(
-                [views, f"{missing:.0%}", f"{wrong:.0%}", name, f"{middle:.2f}", f"{high:.2f}", f"{none.mean():.1%}",
-                 f"{seconds:.1f}"]
-            )  # fmt: skip
-    heads = ["views", "missing", "wrong", "program", "median mm", "95 % mm", "no position", "CPU s per million"]
-    return table(heads, rows)
+            times = f"{none.mean():.1%}", f"{seconds:.1f}"
+            yield [views, f"{missing:.0%}", f"{wrong:.0%}", name, f"{middle:.2f}", f"{high:.2f}", *times]
 
 
 @section("stations.md", "coverage", draws=200)
@@ -224,9 +220,12 @@ def area(polygon: np.ndarray) -> float:
 
 @section("stations.md", "smoke", draws=20)
 @torch.no_grad()
-def smoke(draws: int = 2000) -> Iterator[str]:
+def smoke(draws: int = 2000) -> Lines:
     """Table of crossing bearings."""
-    rows = []
+    yield [
+        "distance", "cones contain it", "cones do not meet", "their area km²", "95 % ellipses contain it",
+        "no position", "their area km²", "median error m",
+    ]  # fmt: skip
     width, edge, shift, heading = 200.0, 5.0, 0.2, 0.2
     for kilometers in (5, 10, 20, 30):
         rig, generator = ring(3, 1e3 * kilometers), torch.Generator().manual_seed(kilometers)
@@ -269,17 +268,12 @@ def smoke(draws: int = 2000) -> Iterator[str]:
             there = points[i, :2].numpy()
             hit.append(len(polygon) > 2 and _contains(polygon, there))
         some = [one for one in crossed if one > 0]
-        rows.append(
-            [f"{kilometers} km", f"{np.mean(hit):.0%}", f"{np.mean(np.array(crossed) == 0):.0%}",
-             f"{np.median(some) / 1e6:.3f}" if some else "", f"{(inside & ok).double().mean():.1%}",
-             f"{(~ok).double().mean():.0%}", f"{areas.median() / 1e6:.3f}",
-             f"{float(error[ok].norm(dim=-1).median()):.0f}"]
-        )  # fmt: skip
-    heads = [
-        "distance", "cones contain it", "cones do not meet", "their area km²", "95 % ellipses contain it",
-        "no position", "their area km²", "median error m",
-    ]  # fmt: skip
-    return table(heads, rows)
+        yield [
+            f"{kilometers} km", f"{np.mean(hit):.0%}", f"{np.mean(np.array(crossed) == 0):.0%}",
+            f"{np.median(some) / 1e6:.3f}" if some else "", f"{(inside & ok).double().mean():.1%}",
+            f"{(~ok).double().mean():.0%}", f"{areas.median() / 1e6:.3f}",
+            f"{float(error[ok].norm(dim=-1).median()):.0f}",
+        ]  # fmt: skip
 
 
 def _contains(polygon: np.ndarray, point: np.ndarray) -> bool:

@@ -22,7 +22,7 @@ from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 from kcal.rig import RigCovariance, planned_rig
 from kcal.track import ClockPrior, Motion
 from scripts.check.track_rivals import CartesianFilters, OfPixels, OfPositions
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 from scripts.shared.sections import section
 from scripts.shared.timing import rms
 
@@ -311,18 +311,16 @@ def tracks(
     yield from clock_table(figures, clock_seconds)
 
 
-def clock_table(figures: Figures, seconds: float) -> Iterator[str]:
+def clock_table(figures: Figures, seconds: float) -> Lines:
     error, sigma = (figures.all(name).reshape(-1, 3) for name in ("long clock", "long clock sigma"))
-    rows: list[list[object]] = []
+    yield [f"clock after {seconds:g} s", "truth", "RMS of error", "stated sigma", "in the 95 % interval"]
     for column, (what, true, unit, scale) in enumerate((
         ("offset at the end", OFFSET + DRIFT * seconds, "ms", 1e3),
         ("drift", DRIFT, "ppm", 1e6),
         ("last row against first", SLOPE, "ms", 1e3),
     )):  # fmt: skip
         inside = int((error[:, column].abs() < 1.96 * sigma[:, column]).sum())
-        rows.append([
+        yield [
             what, f"{scale * true:g} {unit}", f"{scale * rms(error[:, column]):.2f} {unit}",
             f"{scale * rms(sigma[:, column]):.2f} {unit}", f"{inside} of {len(error)}",
-        ])  # fmt: skip
-    head = [f"clock after {seconds:g} s", "truth", "RMS of error", "stated sigma", "in the 95 % interval"]
-    return table(head, rows)
+        ]  # fmt: skip

@@ -20,7 +20,7 @@ from kcal.report.verdict import Requirement, Verdict
 from kcal.rig import pair_by_name, paired_boards
 from kcal.sim.truth import TruthLens
 from scripts.check.verdict_captures import FAULTS, Planted, PlantedPair, drawn
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 
 # What is required of a camera, in a rig with 10 m of baseline; of a rig, from boards alone.
@@ -135,30 +135,28 @@ def wanted(first: int, planted: int, clean: int) -> Iterator[tuple[str, int]]:
 
 
 @section("ordinary.md", "verdict", planted=1, clean=1)
-def verdicts(kept: Kept = NOT_KEPT, planted: int = 200, clean: int = 100, first: int = 200) -> Iterator[str]:
+def verdicts(kept: Kept = NOT_KEPT, planted: int = 200, clean: int = 100, first: int = 200) -> Lines:
     """What happens to captures with a planted fault, and to good ones."""
     lines = kept.records(wanted(first, planted, clean), judge, lambda one: f"{one['yes']}, off {one['off']}")
     bad, fine = ([line for line in lines if (line["kind"] in FAULTS) is fault] for fault in (True, False))
-    rows = []
+    yield [
+        "captures", "number", "yes", "yes, but off by more than required", "by twice that", "all that are off by more",
+        "fault named", "nothing required: yes", f"of these, off by more than {SIGMAS:g} σ",
+        f"no, though within {SIGMAS:g} σ",
+    ]  # fmt: skip
     for kind in [*FAULTS, "all planted", "clean"]:
         here = fine if kind == "clean" else [line for line in bad if kind in ("all planted", line["kind"])]
         if not here:
             continue
         yes, alone = [line for line in here if line["yes"]], [line for line in here if "bare" in line]
-        rows.append([
+        yield [
             kind, len(here), len(yes), sum(broken(line, 1.0) for line in yes), sum(broken(line, 2.0) for line in yes),
             sum(broken(line, 1.0) for line in here), "" if kind == "clean" else sum(map(named, here)),
             *([sum(line["bare"] for line in alone),
                sum(line["bare"] and line["sigmas"] > SIGMAS for line in alone),
                sum(not line["bare"] and line["sigmas"] <= SIGMAS for line in alone)] if alone else [""] * 3),
-        ])  # fmt: skip
-    head = [
-        "captures", "number", "yes", "yes, but off by more than required", "by twice that", "all that are off by more",
-        "fault named", "nothing required: yes", f"of these, off by more than {SIGMAS:g} σ",
-        f"no, though within {SIGMAS:g} σ",
-    ]  # fmt: skip
+        ]  # fmt: skip
     good = [line for line in fine if not broken(line, 1.0)]
-    yield from table(head, rows)
     yield ""
     refused = sum(not line["yes"] for line in good)
     yield f"Of the {len(good)} clean captures that are not off by more than required, {refused} got a no."

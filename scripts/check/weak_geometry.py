@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from unittest import mock
 
 import torch
@@ -21,7 +21,7 @@ from kcal.finding import sentences
 from kcal.locate import enu_from_cam
 from kcal.rig import RigCovariance
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.timing import share
 
@@ -217,13 +217,15 @@ def checked(truth: Rig, found: RigResult, draw: Draw) -> Record:
 
 
 @section("rig.md", "weak geometry", part=0.001, kinds=("random",))
-def weak_geometry(kept: Kept = NOT_KEPT, part: float = 1.0, kinds: tuple[str, ...] = tuple(KINDS)) -> Iterator[str]:
+def weak_geometry(kept: Kept = NOT_KEPT, part: float = 1.0, kinds: tuple[str, ...] = tuple(KINDS)) -> Lines:
     """How many sets are refused and warned of, and of their intervals contain the truth; a part of the sets."""
     numbers = {kind: math.ceil(part * KINDS[kind]) for kind in kinds}
     wanted = sorted((seed / KINDS[kind], kind, seed) for kind, count in numbers.items() for seed in range(count))
     records = kept.records((each[1:] for each in wanted), one, lambda record: record["outcome"])
-    heads = ("sets", "number", "refused", "warned", "accepted")
-    rows = []
+    yield [
+        "sets", "number", "refused", "warned", "accepted", "accepted contain", "warned contain", "warned, not widened",
+        "usable refused",
+    ]  # fmt: skip
     groups = {"random": ("random",), "nearly degenerate, all": DEGENERATE, **{kind: (kind,) for kind in KINDS}}
     for name, members in groups.items():
         own = [record for record in records if record["kind"] in members and record["outcome"] != "too few seen"]
@@ -233,13 +235,10 @@ def weak_geometry(kept: Kept = NOT_KEPT, part: float = 1.0, kinds: tuple[str, ..
         usable = [r for r in own if r["usable"]]
         lost = sum(r["outcome"] == "refused" for r in usable)
         counts = [len(by[what]) for what in ("refused", "warned", "accepted")]
-        rows.append(
-            [name, len(own), *counts]
-            + [percent([r["contained"] for r in by[what]]) for what in ("accepted", "warned")]
-            + [percent([r["unchecked"] for r in by["warned"] if "unchecked" in r]), f"{lost} of {len(usable)}"]
-        )
-    contain = ("accepted contain", "warned contain", "warned, not widened", "usable refused")
-    return table((*heads, *contain), rows)
+        yield [
+            name, len(own), *counts, *(percent([r["contained"] for r in by[what]]) for what in ("accepted", "warned")),
+            percent([r["unchecked"] for r in by["warned"] if "unchecked" in r]), f"{lost} of {len(usable)}",
+        ]  # fmt: skip
 
 
 def percent(shares: Sequence[Sequence[float]]) -> str:

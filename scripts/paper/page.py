@@ -10,23 +10,23 @@ from scripts.paper.range import choice, distance, edges
 from scripts.paper.site import MARK_SIGMA
 from scripts.paper.split import split
 from scripts.paper.tables import table_1, table_3
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 
 
-def _figure_3(results: Results) -> Iterator[str]:
-    models, rows = [*TABLE_3, "hybrid"], []
+def _figure_3(results: Results) -> Lines:
+    models = [*TABLE_3, "hybrid"]
+    yield ["camera", "", *models]
     for name, runs in results.items():
         positions = {m: [position(run, m) for run in runs] for m in models}
         held_out = {m: [run["held_out"][m] for run in runs] for m in models}
         infinity = {
             m: [run["cameras"][m][side]["infinity"] for run in runs for side in ("left", "right")] for m in models
         }
-        rows += [
+        yield from [
             [name, "position, RMS of seven, m", *(number(median(positions[m]), 0) for m in models)],
             [name, "error at infinity, RMS, px", *(number(median(infinity[m]), 3) for m in models)],
             [name, "held-out views, px", *(number(median(held_out[m]), 4) for m in models)],
         ]
-    return table(["camera", "", *models], rows)
 
 
 def _marks(results: Results) -> Iterator[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 from scripts.paper.numbers import (
     DISTANCES,
@@ -22,7 +21,7 @@ from scripts.paper.numbers import (
     rms,
 )
 from scripts.paper.split import FAR_M
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 
 
 def distance(results: Results) -> list[str]:
@@ -74,10 +73,9 @@ def choice(results: Results) -> list[str]:
     ]
 
 
-def edges(results: Results) -> Iterator[str]:
-    rows = []
+def edges(results: Results) -> Lines:
+    yield ["camera", "", *SHOWN]
     for name, runs in results.items():
         for which, title in ((0, "center"), (1, "edge")):
             cells = [median(edge_means(run, label)[which] for run in runs) for label in SHOWN]
-            rows.append([name, title, *(number(cell, 2) for cell in cells)])
-    return table(["camera", "", *SHOWN], rows)
+            yield [name, title, *(number(cell, 2) for cell in cells)]
