@@ -24,7 +24,7 @@ from scripts.paper.numbers import (
     reprojection,
     rig_share,
 )
-from scripts.paper.split import LIMIT
+from scripts.paper.page import LIMIT
 from scripts.shared.page import DOCS
 
 COLORS = {

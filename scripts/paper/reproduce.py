@@ -17,10 +17,9 @@ from pathlib import Path
 
 from scripts.paper.figures import write_figures
 from scripts.paper.numbers import Results
-from scripts.paper.page import SECTIONS
+from scripts.paper.page import SECTIONS, table_2
 from scripts.paper.site import KINDS
 from scripts.paper.solve import ALL, run_seed
-from scripts.paper.tables import table_2
 from scripts.shared.sections import section
 
 # Of runs in little, which share one draw.
