@@ -26,9 +26,8 @@ from kcal.errors import KcalError
 from scripts.bench import solver
 from scripts.shared.children import ALONE, answer, interpreter, or_failure
 from scripts.shared.memory import peak_megabytes
-from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import Lines, table
-from scripts.shared.peer_lenses import calibrated
+from scripts.shared.peer_lenses import calibrated, splined
 from scripts.shared.real_captures import load, names
 from scripts.shared.sections import section
 from scripts.shared.timing import children_seconds

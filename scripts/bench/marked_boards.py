@@ -28,6 +28,7 @@ from kcal.corners.marker_boards import MIN_CORNERS
 from kcal.corners.markers import opencv_dictionary
 from kcal.corners.print_board import TAG_BORDER
 from scripts.bench.hard_boards import (
+    Marked,
     Picture,
     blurred,
     covered,
@@ -41,7 +42,6 @@ from scripts.bench.hard_boards import (
     shaded,
     small,
 )
-from scripts.bench.hard_scenes import Marked
 from scripts.shared.page import table
 from scripts.shared.sections import section
 

@@ -6,7 +6,7 @@ KCAL_LENSBOY name interpreters that have them; elsewhere their cells stay as the
 
 On each held-out view only its pose is solved again; camera and board stay as fitted. Measure: sqrt(sum w² |r|² / count)
 over all folds, with the weights of the file (OpenCV's images: all one). Epipolar error:
-Sampson's distance of held-out corners in pixels, which needs no board.
+Sampson's distance of held-out corners in pixels, which needs no board. *fields*: kinds of fields of the hybrid lens.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from kcal.lens.field_modes import GaussianModes, NetworkModes
 from kcal.lens.zernike import ZernikeModes
 from kcal.nets import FieldTraining
 from scripts.shared.children import interpreter
-from scripts.shared.mrcal_spline import splined
 from scripts.shared.page import Lines, merged
+from scripts.shared.peer_lenses import splined
 from scripts.shared.real_captures import stereo_images
 from scripts.shared.sections import section
 from scripts.shared.wide_lens import folds, load, over_parts, warped

@@ -9,6 +9,11 @@ error that its covariance predicts, over the true one. Places of one capture are
 seed that share poses, and noise but for its size and order, nearly so: --apart gives each its own, and shares are told
 with the standard error between seeds. Parametric models are fitted as `calibrate_camera` does by default, with the
 board's warp. Seeds below 100 were used for tuning the hybrid.
+
+*exact-models*: lenses with OpenCV's 5 or 14 coefficients, drawn at random about those of a surveillance camera, f 1600
+px, without a moving pupil: the worst case for a camera that knows no model. Both ways to take the board: unknown (the
+default; the right model with `board_warp`), and exact (`board="exact"`; the right model as `kcal calibrate --model`
+fits it).
 """
 
 from __future__ import annotations
@@ -22,19 +27,23 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from kcal import KcalError, Observations
 from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.lens import pixel_covariance
-from kcal.sim.captures import LensLike, drawn_lens
+from kcal.lens.camera import Camera
+from kcal.sim.captures import LensLike, board_points, drawn_lens
+from scripts.shared.captures import PAPER_BOARD, capture_corners
 from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import quick
 from scripts.shared.timing import share
-from scripts.shared.traced import BOARD, capture, captures, printed
+from scripts.shared.traced import BOARD, as_observations, capture, captures, printed
+from scripts.shared.views import TRUTH
 
 LENSES = ("webcam", "machine-vision", "surveillance")
 SIGMAS = (0.02, 0.05, 0.1, 0.3)
@@ -187,3 +196,58 @@ def sigmas(
         "",
         *table(["board", "lens", "views", "where boards reached", "beyond", "captures"], rows),
     ]
+
+
+EXACT_MODELS = ("opencv5", "opencv14")
+NOISE = (0.05, 0.2)
+# Relative scatter of the coefficients between lenses.
+SCATTER = 0.3
+
+
+def drawn(model: str, seed: int) -> Camera:
+    """A lens of this model that is regular all over its image."""
+    generator = torch.Generator().manual_seed(seed)
+    count = int(model.removeprefix("opencv"))
+    while True:
+        factors = 1.0 + SCATTER * torch.randn(count, generator=generator, dtype=torch.float64)
+        shift = 8.0 * torch.randn(2, generator=generator, dtype=torch.float64)
+        camera = Camera.build(
+            focal=(1600, 1600),
+            center=tuple((torch.tensor([959.5, 539.5], dtype=torch.float64) + shift).tolist()),
+            size=(1920, 1080),
+            coefficients=(factors * torch.tensor(TRUTH[:count], dtype=torch.float64)).tolist(),
+            model=model,
+        )
+        if bool(camera.unproject(camera.grid(33, 25).reshape(-1, 2))[1].all()):
+            return camera
+
+
+def errors(camera: Camera, views: int, noise: float, seed: int, model: str) -> list[float]:
+    """Error at infinity on one capture, px RMS: default and right model with the board unknown, and both with it."""
+    assert torch.equal(board_points(PAPER_BOARD), BOARD.points)
+    pixels: Tensor = capture_corners(camera, views, sigma=noise, seed=seed).pixels
+    seen = as_observations(pixels, camera.size)
+    options = (
+        CalibrationOptions(),
+        CalibrationOptions(model=model, board_warp=True),
+        CalibrationOptions(board="exact"),
+        CalibrationOptions(model=model),
+    )
+    with torch.no_grad():
+        return [error_at_infinity(calibrate_camera(seen, one).camera, camera).rms for one in options]
+
+
+@section("one-camera.md", "exact-models", seeds=range(200, 201), views=(8,))
+def exact_models(seeds: range = range(200, 204), views: tuple[int, ...] = VIEWS) -> Lines:
+    rows, ratios = [], []
+    for model, count, noise in itertools.product(EXACT_MODELS, views, NOISE):
+        found = [errors(drawn(model, seed), count, noise, 1000 + seed, model) for seed in seeds]
+        typical = [math.exp(statistics.fmean(map(math.log, column))) for column in zip(*found, strict=True)]
+        ratios.append((typical[0] / typical[1], typical[2] / typical[3]))
+        rows.append([model, count, f"{noise:g}", *(f"{v:.3f}" for v in typical[:2]), f"{ratios[-1][0]:.2f}"])
+    unknown, exact = (
+        f"geometric mean {math.exp(statistics.fmean(map(math.log, column))):.2f}, worst {max(column):.2f}"
+        for column in zip(*ratios, strict=True)
+    )
+    yield f"Default camera over the right model: {unknown}; both with the board taken as exact: {exact}."
+    yield ""

@@ -27,9 +27,8 @@ from kcal.lens import camera_difference
 from kcal.report import camera_verdict
 from scripts.shared.children import interpreter
 from scripts.shared.held_out import Projection, held_out
-from scripts.shared.mrcal_camera import splined_camera
 from scripts.shared.page import table
-from scripts.shared.peer_lenses import END, fisheye, opencv
+from scripts.shared.peer_lenses import END, fisheye, opencv, splined_camera
 from scripts.shared.real_captures import RealCapture, load, names
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 

@@ -18,7 +18,7 @@ from kcal.lens.projection import project_components
 from kcal.rig import RasterError, SkylineImage, skyline_attitude, skyline_source
 from scripts.shared.page import Lines
 from scripts.shared.sections import NOT_KEPT, Kept, section
-from scripts.shared.skyline_trials import (
+from scripts.shared.skyline_scenes import (
     HERE,
     Ground,
     Site,

@@ -39,11 +39,10 @@ from kcal.stars.night import Attitude, NamedStars, SkyView, fit_attitude, name_s
 from kcal.stars.sky import Air, StarCatalog, celestial_directions, identify, observed_directions
 from scripts.check.chain_rig import ENU_FROM_RIG, Targets, landmarks, targets, true_rig
 from scripts.shared.long_range import ORIGIN, RANGES, matches_of
-from scripts.shared.night_scenes import PLACE, TIME
+from scripts.shared.night_scenes import PLACE, TIME, lens_trials, star_images
 from scripts.shared.page import Lines, merged, table
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import NOT_KEPT, Kept, section
-from scripts.shared.star_lenses import lens_trials, star_images
 from scripts.shared.timing import rms
 from scripts.shared.traced import BOARD, capture, printed
 

@@ -26,8 +26,8 @@ from kcal.report.verdict import Requirement, Verdict
 from kcal.rig import pair_by_name, paired_boards
 from kcal.sim.captures import PoseOptions, TrueRig, drawn_lens, drawn_rig, sample_board_poses
 from kcal.sim.truth import TruthLens
+from scripts.shared.captures import sample_pair_poses
 from scripts.shared.page import Lines
-from scripts.shared.pair_poses import sample_pair_poses
 from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.traced import printed

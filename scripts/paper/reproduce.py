@@ -16,8 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from scripts.paper.figures import write_figures
-from scripts.paper.numbers import Results
-from scripts.paper.page import SECTIONS, table_2
+from scripts.paper.page import SECTIONS, Results, table_2
 from scripts.paper.site import KINDS
 from scripts.paper.solve import ALL, run_seed
 from scripts.shared.sections import section

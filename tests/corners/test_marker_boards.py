@@ -16,8 +16,7 @@ from kcal.corners.markers import marker_cells, opencv_dictionary
 from kcal.corners.print_board import board_sheet, pattern_shapes
 from kcal.corners.search import NotFoundError
 from kcal.lens import rotation_from_vector
-from scripts.bench.hard_boards import covered, cut, moving, noisy, pictures, plain, small
-from scripts.bench.hard_scenes import Marked
+from scripts.bench.hard_boards import Marked, covered, cut, moving, noisy, pictures, plain, small
 from scripts.bench.marked_boards import WRONG
 from scripts.shared.printed_board import Paper, add, errors, expose, light_of, points_of, pose
 
