@@ -26,7 +26,7 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
-from kcal import Board, Landmarks, Observations, View, calibrate_camera
+from kcal import Board, Landmarks, Observations, calibrate_camera
 from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save_picture
 from kcal.sim.captures import PrintedBoard, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
@@ -38,6 +38,7 @@ from scripts.paper.locate import by_opencv as opencv_rig
 from scripts.shared.captures import capture_corners
 from scripts.shared.peer_lenses import calibrated
 from scripts.shared.timing import show
+from scripts.shared.traced import as_observations
 
 RANGES, BEARINGS = (1000.0, 5000.0), (-32.0, -24.0, -16.0, -8.0, 0.0, 8.0, 16.0, 24.0, 32.0)
 NOISE, VIEWS = 0.05, 20
@@ -63,14 +64,7 @@ def corners(scene: DemoScene, draw: int, side: int) -> Observations:
     board = scene.near_board
     lens = (scene.rig.left, scene.rig.right)[side]
     seen = capture_corners(lens, VIEWS, sigma=NOISE, seed=2 * draw + side, board=board, fill=(0.4, 0.9))
-    views = [
-        View(name=f"{i:02d}", pixels=tuple((float(u), float(v)) for u, v in view)) for i, view in enumerate(seen.pixels)
-    ]
-    return Observations(
-        board=Board(columns=board.columns, rows=board.rows, square=board.square),
-        image_size=lens.size,
-        views=tuple(views),
-    )
+    return as_observations(seen.pixels, lens.size, Board(columns=board.columns, rows=board.rows, square=board.square))
 
 
 def measured(draw: int) -> dict[str, Any]:

@@ -179,7 +179,7 @@ def refinement(squares: tuple[int, ...] = SQUARES, boards: int = 20) -> Lines:
             lost = [f" ({100 * row[3]:.1f} %)" if 5e-4 < row[3] < 1 else "" for row in shown]
             rms = [f"{row[0]:.4f}{more}".replace("nan", "lost") for row, more in zip(shown, lost, strict=True)]
             yield [square, f"{blur:g}", *rms, f"{cell['kcal erf'].row()[4]:.2f}"]
-    yield from ["", summary(cells)]
+    yield summary(cells)
 
 
 @section("corners.md", "real", refinements=("saddle",))

@@ -118,7 +118,7 @@ def accuracy(count: int = 100_000) -> Lines:
         errors = [torch.linalg.vector_norm(each - point, dim=-1) for each in found]
         cells = [f"{float(e.square().mean().sqrt()):.4f}" if sigma else f"{float(e.max()):.1e}" for e in errors]
         yield [name, *cells]
-    yield from ["", geodesy()]
+    yield geodesy()
 
 
 def known_to() -> RigCovariance:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import itertools
 import statistics
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -27,6 +26,7 @@ from scripts.shared.page import Lines
 from scripts.shared.peer_lenses import calibrated
 from scripts.shared.real_captures import stereo_images
 from scripts.shared.sections import section
+from scripts.shared.timing import times
 
 CRITERIA = (3, 300, 1e-12)
 MODELS = ("opencv5", "opencv8", "opencv12", "opencv14")
@@ -70,13 +70,13 @@ def cameras(repeats: int = 5, models: tuple[str, ...] = MODELS) -> Lines:
         options = CalibrationOptions(model=model, weak_prior=None, weighted=False)
         seen = _observe(side)
         count = int(model.removeprefix("opencv"))
-        ours, theirs, times = _in_turn(
+        ours, theirs, spent = _in_turn(
             partial(calibrate_camera, seen, options), partial(calibrated, seen, count, criteria=CRITERIA), repeats
         )
-        ratios = [a / b for a, b in zip(*times, strict=True)]
+        ratios = [a / b for a, b in zip(*spent, strict=True)]
         yield [
             side, model, f"{ours.rms:.7f}", f"{theirs[0]:.7f}", f"{ours.rms - theirs[0]:+.1e}",
-            _median(times[0], 1e3), _median(times[1], 1e3), _median(ratios),
+            _median(spent[0], 1e3), _median(spent[1], 1e3), _median(ratios),
         ]  # fmt: skip
 
 
@@ -86,15 +86,8 @@ def _median(values: list[float], factor: float = 1.0) -> str:
 
 
 def _in_turn(first: Callable[[], Any], second: Callable[[], Any], repeats: int) -> tuple[Any, Any, list[list[float]]]:
-    """Results of both, and their seconds; one run of each first, not counted."""
-    results = [first(), second()]
-    times: list[list[float]] = [[], []]
-    for _ in range(repeats):
-        for which, call in enumerate((first, second)):
-            start = time.perf_counter()
-            results[which] = call()
-            times[which].append(time.perf_counter() - start)
-    return results[0], results[1], times
+    """Results of both, and their seconds."""
+    return first(), second(), times((first, second), repeats)
 
 
 def _points(observations: Observations, also: Observations | None = None) -> tuple[list[Any], list[Any]]:
@@ -116,16 +109,16 @@ def rig(repeats: int = 5) -> Lines:
     pairs = pair_by_name(left.names, right.names)
     for word, refine in (("fixed", False), ("refined jointly", True)):
         options = RigOptions(intrinsics="free" if refine else "fixed", reject=False)
-        ours, theirs, times = _in_turn(
+        ours, theirs, spent = _in_turn(
             partial(calibrate_rig, *both, left, right, pairs, options),
             partial(_opencv_stereo, left, right, both, refine),
             repeats,
         )
         side = triangulated_sides(ours.stereo(), left.board.columns, left.board.rows, ours.pixels)
         found = ours.rms, float(ours.stereo().baseline), side.mean, side.spread
-        for who, (rms, baseline, mean, spread), spent in zip(("kcal", "OpenCV"), (found, theirs), times, strict=True):
+        for who, (rms, baseline, mean, spread), own in zip(("kcal", "OpenCV"), (found, theirs), spent, strict=True):
             squares = f"{1e3 * mean:.4f} ± {1e3 * spread:.4f}"
-            yield [word, who, f"{1e3 * baseline:.5f}", f"{rms:.7f}", squares, _median(spent, 1e3)]
+            yield [word, who, f"{1e3 * baseline:.5f}", f"{rms:.7f}", squares, _median(own, 1e3)]
 
 
 def _opencv_stereo(

@@ -7,9 +7,7 @@ of noise; lenses have five coefficients, kcal fits its default.
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import subprocess
 import sys
 import tempfile
@@ -22,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Board, Camera, Localizer, Observations, RigData, View, calibrate_camera, save_rig, solve_rig
+from kcal import Board, Camera, Localizer, RigData, calibrate_camera, save_rig, solve_rig
 from kcal.calibrate.rig.pairs import boards_of_several
 from kcal.lens import rotation_from_vector
 from kcal.lens.pair_errors import RigCovariance
@@ -30,12 +28,13 @@ from kcal.lens.rig import Mounting, Origin, Rig
 from kcal.locate import terrain
 from kcal.locate.siting import Site, area_of, rank_sites, siting_map
 from kcal.rig import planned_rig
-from scripts.shared.children import interpreter
+from scripts.shared.children import answer, interpreter
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.sections import section
 from scripts.shared.station_scenes import drawn_errors, hills, marks, ring, targets
-from scripts.shared.timing import children_seconds, show
+from scripts.shared.timing import children_seconds, show, times
+from scripts.shared.traced import as_observations
 
 _CORNER, _CELL = (44.75, 5.72), 0.0014
 _TOWERS = (("mill", 44.9, 5.85), ("church", 45.1, 5.9), ("mast", 45.15, 6.15), ("hill", 44.87, 6.1), ("dam", 45.0, 6.0))
@@ -56,7 +55,7 @@ def _hilltop(ground: Tensor, name: str, lat: float, lon: float) -> Site:
 
 
 @section("stations.md", "sites", cells=20)
-def sites(cells: int = 200, write: bool = False) -> Iterator[str]:
+def sites(cells: int = 200, write: bool = False) -> Lines:
     """Time of a map and of the order of candidates, and the picture of the how-to page."""
     from kcal.report.figures import save_picture
     from kcal.report.positions import siting_figure
@@ -88,8 +87,8 @@ def sites(cells: int = 200, write: bool = False) -> Iterator[str]:
     lap("10 candidates, all in order")
     if write:
         save_picture(DOCS.parent / "howto" / "sites.png", siting_figure(area, towers, ranked))
-    yield from table(["step", "CPU s"], rows)
-    yield from ["", f"Peak memory {peak_megabytes():.0f} MB, libraries included."]
+    yield from [["step", "CPU s"], *rows]
+    yield f"Peak memory {peak_megabytes():.0f} MB, libraries included."
 
 
 @section("stations.md", "frame", rounds=1)
@@ -106,13 +105,9 @@ def frame(rounds: int = 20) -> Lines:
     for name, pixels in (("all seen, none wrong", seen), ("10 % missing, 5 % wrong", spoiled)):
         for errors, known in (("marks alone", torch.zeros(1, rig.quantities).double()), ("all errors", root)):
             localize = Localizer(rig, root=known, pixel_sigma=0.3)
-            spent = []
             with torch.no_grad():
-                for _ in range(rounds + 1):
-                    start = time.process_time()
-                    localize(pixels)
-                    spent.append(time.process_time() - start)
-            yield [name, errors, f"{1e3 * float(np.median(spent[1:])):.0f}"]
+                (spent,) = times([lambda: localize(pixels)], rounds, time.process_time)  # noqa: B023
+            yield [name, errors, f"{1e3 * float(np.median(spent)):.0f}"]
 
 
 @section("stations.md", "two", pairs=1000)
@@ -223,36 +218,24 @@ def together(cameras: int, views: int) -> Iterator[list[str]]:
             moments.append((pixels + _NOISE_PX * draw(*pixels.shape)).movedim(1, 0))
     corners = torch.stack(moments)  # (V, C, N, 2)
     start = time.process_time()
-    observed = {
-        c: Observations(board=board, image_size=(1920, 1080), views=tuple(
-            View(name=f"{i:03d}.png", pixels=tuple((u, v) for u, v in corners[i, c].tolist())) for i in range(views)))
-        for c in range(cameras)
-    }  # fmt: skip
+    observed = {c: as_observations(corners[:, c], (1920, 1080), board) for c in range(cameras)}
     calibrated = tuple(calibrate_camera(one).camera for one in observed.values())
     alone = time.process_time() - start
     data = RigData(cameras=calibrated, names=rig.names, boards=boards_of_several(calibrated, rig.names, observed))
     found = solve_rig(data)
     spent = time.process_time() - start
-    yield [
-        "kcal",
-        f"{spent:.0f}",
-        f"{alone:.0f}",
-        f"{peak_megabytes():.0f}",
-        *_errors(rig, found.rotation, found.center),
-    ]
+    errors = _errors(rig, found.rotation, found.center)
+    yield ["kcal", f"{spent:.0f}", f"{alone:.0f}", f"{peak_megabytes():.0f}", *errors]
     if python := interpreter("mrcal"):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "problem.npz")
             np.savez(
                 path, corners=corners.numpy(), image_size=[1920, 1080], board_size=[9, 6], square_m=0.1, focal=1400.0
             )
-            script = Path(__file__).with_name("peer_mrcal_many.py")
-            environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-            done = subprocess.run([python, script, path], capture_output=True, text=True, env=environment)
-            if done.returncode:
-                show([done.stderr[-500:]])
+            other = answer(python, Path(__file__).with_name("peer_mrcal_many.py"), path)
+            if "failed" in other:
+                show([other["failed"]])
             else:
-                other = json.loads(done.stdout.splitlines()[-1])
                 poses = (torch.tensor(other[name], dtype=torch.float64) for name in ("rotation", "center"))
                 yield ["mrcal, OPENCV8", f"{other['cpu']:.0f}", "", f"{other['peak']:.0f}", *_errors(rig, *poses)]
 

@@ -30,9 +30,7 @@ import torch
 from torch import Tensor
 
 from kcal import KcalError, Observations
-from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.lens import pixel_covariance
 from kcal.lens.camera import Camera
 from kcal.sim.captures import LensLike, board_points, drawn_lens
 from scripts.shared.captures import PAPER_BOARD, capture_corners
@@ -40,12 +38,11 @@ from scripts.shared.infinity import error_at_infinity
 from scripts.shared.page import Lines, table
 from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
-from scripts.shared.simulated import quick
+from scripts.shared.simulated import LENSES, figures, quick
 from scripts.shared.timing import share
 from scripts.shared.traced import BOARD, as_observations, capture, captures, printed
 from scripts.shared.views import TRUTH
 
-LENSES = ("webcam", "machine-vision", "surveillance")
 SIGMAS = (0.02, 0.05, 0.1, 0.3)
 SHOWN = 0.1  # px of noise of the cells that the page shows; means are over all
 VIEWS = (60, 30, 8)
@@ -57,8 +54,6 @@ MODELS = {
     "opencv14": CalibrationOptions(model="opencv14", board_warp=True),
     "ext20": CalibrationOptions(model="ext20", board_warp=True),
 }
-# Squared distance that a normal vector of two components exceeds once in twenty times.
-CHI2 = -2.0 * math.log(0.05)
 
 
 def cell(
@@ -103,19 +98,8 @@ def measured(lens: LensLike, seen: Observations, options: CalibrationOptions) ->
     record: Record = {"rms": error.rms, "cpu_s": spent, "valid": error.valid, "noise": result.noise}
     if result.hybrid is None:
         return record
-    covariance = pixel_covariance(result.camera, error.pixels.reshape(-1, 2))
-    e = error.errors.reshape(-1, 2)
-    good = e.isfinite().all(-1) & covariance.isfinite().all(-1).all(-1)
-    distance = (e * torch.linalg.solve(covariance, e[..., None])[..., 0]).sum(-1)
-    rows, columns = error.pixels.shape[:2]
-    within = reached(seen, columns, rows).reshape(-1)
-    return record | {
-        "tempering": result.hybrid.tempering,
-        "port": "port_x" in result.camera.names,
-        "inside": float((distance < CHI2)[good & within].double().mean()),
-        "beyond": float((distance < CHI2)[good & ~within].double().mean()),
-        "predicted": float(covariance[good].diagonal(dim1=-2, dim2=-1).sum(-1).mean().sqrt()),
-    }
+    told = {"tempering": result.hybrid.tempering, "port": "port_x" in result.camera.names}
+    return record | told | figures(result.camera, seen, error.pixels, error.errors)
 
 
 @section(
@@ -250,4 +234,3 @@ def exact_models(seeds: range = range(200, 204), views: tuple[int, ...] = VIEWS)
         for column in zip(*ratios, strict=True)
     )
     yield f"Default camera over the right model: {unknown}; both with the board taken as exact: {exact}."
-    yield ""

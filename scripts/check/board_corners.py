@@ -14,7 +14,6 @@ import itertools
 import math
 import statistics
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -149,7 +148,7 @@ def real_lines(records: list[Record]) -> Lines:
 def of_simulated(
     kept: Kept = NOT_KEPT, seeds: range = range(100), boards: tuple[str, ...] = ("exact", "corners"),
     views: tuple[int, ...] = VIEWS, noises: tuple[float, ...] = NOISES,
-) -> Iterator[str]:  # fmt: skip
+) -> Lines:  # fmt: skip
     keys = [
         (board, noise, count, seed) for seed, board, noise, count in itertools.product(seeds, boards, noises, views)
     ]
@@ -157,7 +156,7 @@ def of_simulated(
 
 
 @section("one-camera.md", "board-corners-real", pairs=("stereo_left",))
-def of_real(kept: Kept = NOT_KEPT, pairs: tuple[str, ...] = tuple(pair[0] for pair in PAIRS)) -> Iterator[str]:
+def of_real(kept: Kept = NOT_KEPT, pairs: tuple[str, ...] = tuple(pair[0] for pair in PAIRS)) -> Lines:
     """The pairs of cameras in KCAL_DATA that begin with these."""
     keys = [("real", *names) for pair in PAIRS if pair[0] in pairs for names in (pair, pair[::-1])]
     return real_lines(kept.records(keys, real))

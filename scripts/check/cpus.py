@@ -25,7 +25,7 @@ import sys
 import tempfile
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -301,7 +301,7 @@ def tests_table(found: dict[str, dict[str, str]]) -> list[str]:
 @section("other-programs.md", "cpus", settings=("this CPU", "Intel, AVX2"), cameras=("simulated, opencv5",))
 def figures(
     folder: Path | None = None, settings: tuple[str, ...] = tuple(SETTINGS), cameras: tuple[str, ...] = ("",)
-) -> Iterator[str]:
+) -> Lines:
     """Compute all stages under each setting, into folders, and compare each with the first; or only these cameras."""
     with tempfile.TemporaryDirectory(prefix="kcal-cpus-") as name:
         yield from _figures(make_folder(folder or Path(name)), settings, cameras)

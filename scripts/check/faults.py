@@ -98,7 +98,7 @@ def contained(found: RigResult) -> list[bool]:
 
 
 @section("rig.md", "faults", seeds=range(1))
-def of_rigs(seeds: range = range(20)) -> Iterator[str]:
+def of_rigs(seeds: range = range(20)) -> Lines:
     return table(["rigs", "refused", "named", "plain", "left out", "contained"], _rig_rows(seeds))
 
 

@@ -28,7 +28,6 @@ from typing import NamedTuple
 import psutil
 
 from scripts.shared.memory import peak_megabytes
-from scripts.shared.page import table
 from scripts.shared.sections import section
 from scripts.shared.small_photographs import COLUMNS, HEIGHT, ROWS, WIDTH, photographs
 from scripts.shared.timing import children_seconds
@@ -251,8 +250,7 @@ def fleet(
             [first, second],
             children_seconds() - before,
         )
-    yield from table(HEAD, rows)
-    yield ""
+    yield from [HEAD, *rows]
     yield (
         f"{cameras:,} cameras of {views} images of {WIDTH} x {HEIGHT}, {model}, {workers} workers of one thread, "
         f"a kill after every {every} pieces of work."

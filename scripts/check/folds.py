@@ -261,7 +261,7 @@ def ordinary_lenses(count: int, seed: int) -> Lines:
 @section("lens.md", "folds", lenses=3, compared=1, ordinary=0)
 def folds(
     lenses: int = 10_000, compared: int = 1000, minutes: float = math.inf, ordinary: int = 400, seed: int = 0
-) -> Iterator[str]:
+) -> Lines:
     yield from constructed(lenses, seed, compared, minutes)
     if ordinary:
         yield ""

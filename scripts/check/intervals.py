@@ -15,7 +15,6 @@ import itertools
 import math
 import statistics
 import time
-from collections.abc import Iterator
 
 from kcal import CalibrationOptions, KcalError, calibrate_camera
 from kcal.calibrate.camera.trust import against_capture, interval_check, simulated_capture, simulated_refits
@@ -39,7 +38,7 @@ def judged(model: str, seed: int, refits: int) -> Record:
     try:
         result = calibrate_camera(case.seen, options)
         error = error_at_infinity(result.camera, case.lens)
-        truth = figures(result, case, error.pixels, error.errors)
+        truth = figures(result.camera, case.seen, error.pixels, error.errors)
         start = time.process_time()
         check = interval_check(result, AT, simulated_refits(result, options, AT, range(refits)))
         spent = time.process_time() - start
@@ -116,5 +115,5 @@ def cold_and_warm(count: int = 8, seeds: range = range(4)) -> Lines:
 
 
 @section("ordinary.md", "intervals", seeds=range(1), refits=2)
-def intervals(kept: Kept = NOT_KEPT, seeds: range = range(20), refits: int = 100) -> Iterator[str]:
+def intervals(kept: Kept = NOT_KEPT, seeds: range = range(20), refits: int = 100) -> Lines:
     return lines(kept.records(itertools.product(MODELS, seeds, [refits]), judged))

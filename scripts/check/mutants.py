@@ -44,7 +44,7 @@ import pytest
 
 from scripts.check.mutations import Site, sites
 from scripts.shared.children import children
-from scripts.shared.page import Lines, laid_out, read_section, table
+from scripts.shared.page import Line, Lines, laid_out, read_section
 from scripts.shared.sections import section
 from scripts.shared.timing import show
 
@@ -442,7 +442,7 @@ def first_draw(by_seed: dict[int, Draw], row: tuple[str, ...] | None) -> str:
     return by_seed[min(by_seed)].share if len(by_seed) > 1 else ""
 
 
-def report() -> tuple[list[str], list[str]]:
+def report() -> tuple[list[Line], list[Line]]:
     """A table of the rooms, the first and the last draw of each; and what was not noticed, or is harmless, by line."""
     kept, at_first, known = results(), results(first=True), rows_of_page()
     rows: list[tuple[object, ...]] = []
@@ -488,11 +488,10 @@ def report() -> tuple[list[str], list[str]]:
     )
     heads = ("room", "first draw", "last draw: seed", "drawn", "harmless", "noticed")
     lines = [
-        f"Not noticed ({len(missed)})", "",
-        *table(("line", "seed", "kind", "before", "after", "tests", "key"), missed), "",
-        f"Harmless ({len(idle)})", "", *table(("line", "seed", "kind", "before", "after", "why"), idle),
+        f"Not noticed ({len(missed)})", ("line", "seed", "kind", "before", "after", "tests", "key"), *missed,
+        f"Harmless ({len(idle)})", ("line", "seed", "kind", "before", "after", "why"), *idle,
     ]  # fmt: skip
-    return [*table(heads, rows), "", summary], lines
+    return [heads, *rows, summary], lines
 
 
 def time_table(rooms: Sequence[str]) -> Lines:
@@ -508,7 +507,7 @@ def time_table(rooms: Sequence[str]) -> Lines:
 def mutants(
     rooms: tuple[str, ...] = ROOMS, sample: int = 8, seed: int = 1, seconds: float = math.inf, budget: float = 30.0,
     again: bool = False, times: bool = False,
-) -> list[str]:  # fmt: skip
+) -> list[Line]:  # fmt: skip
     if times:
         show(list(laid_out(time_table(rooms))))
         return []
@@ -525,5 +524,5 @@ def mutants(
             if site.key not in HARMLESS and (site.key not in kept or repeat):
                 judge(files, path, number, site, budget, seed)
     found, lines = report()
-    show(lines)
+    show(list(laid_out(lines)))
     return found

@@ -182,7 +182,7 @@ def drawn(frames: int, seed: int) -> tuple[dict[bool, list[Counts]], list[Pair]]
 
 @section("pairing.md", "association", frames=1)
 def association(frames: int = 20, seed: int = 0) -> Lines:
-    yield from [f"{frames} frames of {TARGETS} objects.", ""]
+    yield f"{frames} frames of {TARGETS} objects."
     yield ["pairs by", "to be found", "precision", "recall", "precision of those not ambiguous", "ambiguous"]
     for looks, some in drawn(frames, seed)[0].items():
         total = Counts(*np.sum(some, axis=0).tolist())

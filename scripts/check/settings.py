@@ -15,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -174,6 +173,6 @@ def lines(records: list[Record], noises: int) -> Lines:
 @section("settings.md", "settings", lenses=1, noises=1, kinds=("zoom",))
 def settings(
     kept: Kept = NOT_KEPT, kinds: tuple[str, ...] = ("zoom", "focus"), lenses: int = 10, noises: int = 3
-) -> Iterator[str]:
+) -> Lines:
     found = kept.records([(kind, seed, noises) for kind in kinds for seed in range(lenses)], work, shown)
     return lines([record for record in found if record["key"][2] == noises], noises)

@@ -235,7 +235,7 @@ SIZES = {(1600.0, (1920, 1080)), (5110.0, (1024, 768)), (900.0, (1280, 800))}
 
 
 @section("stars.md", "real", images=2)
-def real(images: int = 6) -> Iterator[str]:
+def real(images: int = 6) -> Lines:
     """So many real images: names, times, one lens, residuals by magnitude, and each image predicted by the others."""
     files = sorted((data_folder() / "stars").glob("*.png"))[:images]
     views = [SkyView(time=time_of("name:Z", path), origin=DELFT) for path in files]
@@ -332,7 +332,7 @@ def peer(files: list[Path]) -> dict[Path, list[str]]:
 
 
 @section("stars.md", "random", count=2)
-def random_points(count: int = 10_000) -> Iterator[str]:
+def random_points(count: int = 10_000) -> Lines:
     """False names of random points: of 4 to 20 points each, seen by three cameras in turn."""
     generator, wrong, begin = np.random.default_rng(34), 0, time.process_time()
     cameras = sorted(SIZES)

@@ -6,10 +6,10 @@ filter (the package `stonesoup`) get the same pairs.
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import datetime
 import math
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +32,7 @@ from kcal.pipeline.pairing import ObjectViews
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 from kcal.rig import RigCovariance, planned_rig
 from kcal.track import ClockPrior, Motion
-from scripts.shared.page import Lines, table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 from scripts.shared.timing import rms
 
@@ -277,23 +277,19 @@ def gospa(found: Tensor, true: Tensor, cutoff: float) -> float:
     return math.sqrt(float(matched[real].sum() + cutoff**2 / 2 * alone))
 
 
-class Figures:
-    """Sums over seeds."""
+class Figures(collections.defaultdict[str, list[Tensor]]):
+    """Values over seeds by name."""
 
     def __init__(self) -> None:
-        self.errors: dict[str, list[Tensor]] = {}
-        self.numbers: dict[str, list[float]] = {}
+        super().__init__(list)
 
     def add(self, name: str, values: Tensor | float) -> None:
         """Keep values under a name."""
-        if isinstance(values, Tensor):
-            self.errors.setdefault(name, []).append(values.double().flatten())
-        else:
-            self.numbers.setdefault(name, []).append(values)
+        self[name].append(torch.as_tensor(values, dtype=torch.float64).flatten())
 
     def all(self, name: str) -> Tensor:
         """All that was kept."""
-        return torch.cat(self.errors[name])
+        return torch.cat(self[name])
 
 
 def relative(state: Any, true: Tensor) -> Tensor:
@@ -400,9 +396,7 @@ def compare(
 
 
 @section("tracks.md", "tracks", seeds=range(1), seconds=4.0, clock_seeds=1, clock_seconds=3.0)
-def tracks(
-    seeds: range = range(4), seconds: float = 12.0, clock_seeds: int = 4, clock_seconds: float = 60.0
-) -> Iterator[str]:
+def tracks(seeds: range = range(4), seconds: float = 12.0, clock_seeds: int = 4, clock_seconds: float = 60.0) -> Lines:
     """Seeds and seconds of the tracks, and of the runs of the clock."""
     figures = Figures()
     for seed in seeds:
@@ -410,57 +404,48 @@ def tracks(
     for seed in range(clock_seeds):
         run_clock(100 + seed, clock_seconds, figures)
     meters = 5000.0**2
-    rows: list[list[object]] = [["single frame", f"{rms(figures.all('single')) * meters:,.0f} m", ""]]
-    for name in ("1 s", "10 s"):
-        if f"range {name}" in figures.errors:
-            error, bound = rms(figures.all(f"range {name}")), rms(figures.all(f"bound {name}"))
-            rows.append([f"after {name}", f"{error * meters:,.0f} m", f"{error / bound:.2f}"])
-    outputs = [
-        [name, f"{100 * float((figures.all(key).abs() < 1.96).double().mean()):.1f} %", len(figures.all(key))]
-        for name, key in (("range", "filter"), ("position, each axis", "position"), ("velocity, each axis", "velocity"),
-                          ("range, smoothed", "smoother"), ("clock offset", "clock"))
-    ]  # fmt: skip
-    offset = figures.all("clock ms")
-    # Of a target at 30 m/s that crosses at 5 km: range times speed over baseline.
-    lost = [5000.0 * 30.0 / 10.0 * ms / 1e3 for ms in (40.0, rms(offset))]
     yield (
         f"{TARGETS} targets from 100 m to 5 km, six of them at 5 km and 30 m/s; cameras of 10 and 25 frames a second; "
         f"boxes {BEARING_PX} px, matching {MATCH_PX} px; relative yaw known to {YAW_SIGMA}°; {seconds:g} s, "
         f"{len(seeds)} draws of rig, targets and noise."
     )
+    yield ["range at 5 km", "RMS of error (of the inverse range, times 5 km squared)", "over its stated sigma"]
+    yield ["single frame", f"{rms(figures.all('single')) * meters:,.0f} m", ""]
+    for name in ("1 s", "10 s"):
+        if f"range {name}" in figures:
+            error, bound = rms(figures.all(f"range {name}")), rms(figures.all(f"bound {name}"))
+            yield [f"after {name}", f"{error * meters:,.0f} m", f"{error / bound:.2f}"]
     yield ""
-    yield from table(
-        ["range at 5 km", "RMS of error (of the inverse range, times 5 km squared)", "over its stated sigma"], rows
-    )
-    yield ""
-    yield from table(["output", "in the 95 % interval", "cases"], outputs)
-    yield ""
+    yield ["output", "in the 95 % interval", "cases"]
+    for name, key in (("range", "filter"), ("position, each axis", "position"), ("velocity, each axis", "velocity"),
+                      ("range, smoothed", "smoother"), ("clock offset", "clock")):  # fmt: skip
+        values = figures.all(key)
+        yield [name, f"{100 * float((values.abs() < 1.96).double().mean()):.1f} %", len(values)]
     smallest = float(figures.all("floor").min())
     yield f"Smallest eigenvalue of covariance minus systematic part, over its trace: {smallest:.1e}."
+    offset = figures.all("clock ms")
+    # Of a target at 30 m/s that crosses at 5 km: range times speed over baseline.
+    lost = [5000.0 * 30.0 / 10.0 * ms / 1e3 for ms in (40.0, rms(offset))]
     yield ""
     yield (
         f"Clock: offset of {1e3 * OFFSET:g} ms found with an RMS error of {rms(offset):.2f} ms, stated "
         f"{rms(figures.all('clock sigma ms')):.2f} ms. A target at 30 m/s that crosses at 5 km is wrong by "
         f"{lost[0]:.0f} m without and {lost[1]:.0f} m with it."
     )
-    yield ""
-    mean = {name: float(np.mean(values)) for name, values in figures.numbers.items()}
-    missed, doubled, followed = (sum(figures.numbers[f"pixels: {name}"]) for name in ("missed", "doubled", "followed"))
-    kinds = {
-        "equal information: the pairs, the true rig, the clock; unscented, Cartesian": "pixels",
-        "positions as measurements, Kalman filter, Cartesian; the believed rig": "positions",
-    }
-    both = ((what, mean[f"{kind}: kcal"], mean[f"{kind}: stonesoup"]) for what, kind in kinds.items())
-    yield from table(
-        ["GOSPA (cutoff 300 m) of the targets that both follow", "kcal", "Stone Soup", "kcal over Stone Soup"],
-        ([what, f"{own:.1f} m", f"{other:.1f} m", f"{own / other:.3f}"] for what, own, other in both),
+    yield ["GOSPA (cutoff 300 m) of the targets that both follow", "kcal", "Stone Soup", "kcal over Stone Soup"]
+    for what, kind in (
+        ("equal information: the pairs, the true rig, the clock; unscented, Cartesian", "pixels"),
+        ("positions as measurements, Kalman filter, Cartesian; the believed rig", "positions"),
+    ):
+        own, other = (float(figures.all(f"{kind}: {who}").mean()) for who in ("kcal", "stonesoup"))
+        yield [what, f"{own:.1f} m", f"{other:.1f} m", f"{own / other:.3f}"]
+    missed, doubled, followed = (
+        float(figures.all(f"pixels: {name}").sum()) for name in ("missed", "doubled", "followed")
     )
-    yield ""
     yield (
         f"Stone Soup's filters are told whose each sighting is. Of {followed:,.0f} targets in all moments kcal's "
         f"tracker has no position for {missed:,.0f} and two for {doubled:,.0f}."
     )
-    yield ""
     yield from clock_table(figures, clock_seconds)
 
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from kcal import Board, Camera, KcalError, Observations, RigData, View, solve_rig
+from kcal import Board, Camera, KcalError, Observations, RigData, solve_rig
 from kcal.calibrate import examine
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.lens import rotation_from_vector
@@ -30,7 +30,7 @@ from scripts.shared.captures import sample_pair_poses
 from scripts.shared.page import Lines
 from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
-from scripts.shared.traced import printed
+from scripts.shared.traced import as_observations, printed
 
 FAULTS = ("model", "fronto-parallel", "warp", "blur", "unsynchronized", "pupil", "mirrored or mixed")
 BOARD = Board(columns=9, rows=6, square=0.04)
@@ -64,17 +64,11 @@ class PlantedPair:
     detail: str
 
 
-def observed(
-    pixels: Tensor, size: tuple[int, int], spread: Tensor | None = None, names: list[str] | None = None
-) -> Observations:
+def observed(pixels: Tensor, size: tuple[int, int], spread: Tensor | None = None, board: Board = BOARD) -> Observations:
     """Corners (V, N, 2) as observations; `spread` (V,) is the stated noise of each view's corners, px."""
-    views = []
-    for i, view in enumerate(pixels.tolist()):
-        corners = tuple(None if u != u else (u, v) for u, v in view)
-        own = None if spread is None else float(spread[i]) ** 2
-        covariance = None if own is None else tuple(None if c is None else (own, 0.0, own) for c in corners)
-        views.append(View(name=names[i] if names else f"{i:03d}.png", pixels=corners, covariance=covariance))
-    return Observations(board=BOARD, image_size=size, views=tuple(views))
+    eye = torch.eye(2, dtype=torch.float64)
+    stated = None if spread is None else (spread.square()[:, None, None, None] * eye).expand(*pixels.shape, 2)
+    return as_observations(pixels, size, board, covariance=stated)
 
 
 def corners_of(lens: TruthLens, points: Tensor, poses: Sequence[tuple[Tensor, Tensor]], noise: Tensor) -> Tensor:
@@ -94,7 +88,7 @@ def drawn(kind: str, seed: int) -> Planted | PlantedPair:
     if kind in ("unsynchronized", "clean pair"):
         return _pair(kind, draw, seed, generator)
     views, sigma = draw.randint(18, 28), draw.uniform(0.05, 0.2)
-    points, options, names = BOARD.points, CalibrationOptions(), None
+    points, options = BOARD.points, CalibrationOptions()
     design, strength, wander, fill, tilt = "machine-vision", draw.uniform(0.5, 1.5), 0.3, (0.25, 0.8), 0.0
     detail = ""
     if kind == "clean":
@@ -157,7 +151,7 @@ def drawn(kind: str, seed: int) -> Planted | PlantedPair:
             detail = f"two boards, {100 * stretch:.1f} %"
         pixels = grid.flatten(1, 2)
     stated = spread if kind == "blur" or draw.random() < 0.5 else None
-    return Planted(lens=lens, observations=observed(pixels, lens.size, stated, names), options=options, detail=detail)
+    return Planted(lens=lens, observations=observed(pixels, lens.size, stated), options=options, detail=detail)
 
 
 def _parallel(pose: Pose, tilt: float, generator: torch.Generator) -> Pose:
@@ -200,7 +194,7 @@ def _pair(kind: str, draw: random.Random, seed: int, generator: torch.Generator)
             noisy = pixels + noise
             seen[c].append(torch.where((valid & lens.inside(noisy))[:, None], noisy, torch.nan))
     pairs = [
-        observed(torch.stack(side), lens.size).model_copy(update={"board": large})
+        observed(torch.stack(side), lens.size, board=large)
         for side, lens in zip(seen, (rig.left, rig.right), strict=True)
     ]
     return PlantedPair(rig=rig, alone=(alone[0], alone[1]), pairs=(pairs[0], pairs[1]), detail=f"{1000 * speed:.0f} mm")
@@ -340,6 +334,5 @@ def verdicts(kept: Kept = NOT_KEPT, planted: int = 200, clean: int = 100, first:
                sum(not line["bare"] and line["sigmas"] <= SIGMAS for line in alone)] if alone else [""] * 3),
         ]  # fmt: skip
     good = [line for line in fine if not broken(line, 1.0)]
-    yield ""
     refused = sum(not line["yes"] for line in good)
     yield f"Of the {len(good)} clean captures that are not off by more than required, {refused} got a no."

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
 from scripts.paper.site import KINDS, MARK_SIGMA
-from scripts.shared.page import Lines, table
+from scripts.shared.page import Line, Lines, table
 
 Results = dict[str, list[dict]]
 DISTANCES = ("100 m", "250 m", "500 m", "1 km", "2 km", "3.5 km", "5 km")
@@ -331,7 +331,7 @@ def _far_share(runs: list[dict], label: str, kind: str) -> float:
     return median(errors)
 
 
-SECTIONS: dict[str, Callable[[Results], Iterable[str]]] = {
+SECTIONS: dict[str, Callable[[Results], Iterable[Line]]] = {
     "split": split,
     "table 1": table_1,
     "table 3": table_3,

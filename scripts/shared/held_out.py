@@ -204,12 +204,7 @@ def _start(problem: _Problem) -> _State | None:
         state = _solve(problem, state, distance, moves=False, shared=False)
         cost = np.nan_to_num(problem.squares(state, distance), nan=math.hypot(*problem.camera.size) ** 2).sum(1)
         if best is not None:
-            keep = best[1] <= cost
-            state = dataclasses.replace(
-                state,
-                rotation=np.where(keep[:, None, None], best[0].rotation, state.rotation),
-                middle=np.where(keep[:, None], best[0].middle, state.middle),
-            )
+            state = _chosen(best[1] <= cost, best[0], state)
             cost = np.minimum(cost, best[1])
         best = state, cost
     return best[0] if best else None

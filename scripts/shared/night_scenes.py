@@ -17,7 +17,6 @@ from torch import Tensor
 
 from kcal import Baseline, Camera, MeasuredPosition, Origin, RigData, calibrate_camera
 from kcal.calibrate.rig.marks import StarSource
-from kcal.lens import pixel_covariance
 from kcal.lens.projection import FAR
 from kcal.locate import enu_from_cam
 from kcal.rig import Effect
@@ -30,7 +29,7 @@ from kcal.stars.sky import EARTH_RATE, StarCatalog, observed_directions, pole_in
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.long_range import matches_of
 from scripts.shared.prescriptions import PRESCRIPTIONS
-from scripts.shared.simulated import CHI2, LENSES
+from scripts.shared.simulated import LENSES, figures
 from scripts.shared.traced import BOARD, capture, printed
 
 TIME = datetime.datetime(2026, 11, 24, 4, 0, tzinfo=datetime.UTC)
@@ -158,14 +157,10 @@ class LensTrial(NamedTuple):
 def compared(camera: Camera, lens: TruthLens, agreement: Agreement | None = None) -> LensTrial:
     """How far a camera is from the traced lens."""
     error = error_at_infinity(camera, lens, columns=33, rows=19)
-    off, at = error.errors.reshape(-1, 2), error.pixels.reshape(-1, 2)
-    covariance = pixel_covariance(camera, at)
-    good = off.isfinite().all(-1) & covariance.isfinite().all(-1).all(-1)
-    square = (off[good] * torch.linalg.solve(covariance[good], off[good])).sum(-1)
     return LensTrial(
         rms=error.rms,
         largest=error.maximum,
-        inside=float((square < CHI2).double().mean()),
+        inside=figures(camera, None, error.pixels, error.errors)["everywhere"],
         chi2=math.nan if agreement is None else agreement.chi2 / max(agreement.freedom, 1),
         contradiction=agreement is not None and agreement.contradiction is not None,
     )

@@ -13,7 +13,8 @@ from pathlib import Path
 from scripts.shared.timing import row
 
 # What a section of a page yields: texts, and the heads and rows of tables (`laid_out`).
-Lines = Iterator[str | Sequence[object]]
+Line = str | Sequence[object]
+Lines = Iterator[Line]
 DOCS = Path(__file__).parents[2] / "docs" / "measured"
 
 
@@ -63,7 +64,7 @@ def table(heads: Sequence[object], rows: Iterable[Sequence[object]]) -> Iterator
     return laid_out(itertools.chain([heads], rows))
 
 
-def laid_out(parts: Iterable[str | Sequence[object]]) -> Iterator[str]:
+def laid_out(parts: Iterable[Line]) -> Iterator[str]:
     """Lines of Markdown, each as soon as its part is there: texts as they are, and rows as tables, heads first.
 
     A text ends a table; an empty line is put between the two.

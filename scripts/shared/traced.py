@@ -60,11 +60,22 @@ def captures(
     return out
 
 
-def as_observations(pixels: Tensor, size: tuple[int, int], board: Board = BOARD) -> Observations:
-    """Corners (V, N, 2) of the board, NaN where not seen, as an observations file."""
-    corners = [tuple(None if u != u else (u, v) for u, v in view) for view in pixels.tolist()]
-    views = tuple(View(name=f"{i:03d}", pixels=view) for i, view in enumerate(corners))
-    return Observations(board=board, image_size=size, views=views)
+def as_observations(
+    pixels: Tensor,
+    size: tuple[int, int],
+    board: Board = BOARD,
+    *,
+    covariance: Tensor | None = None,
+    names: Sequence[str] = (),
+) -> Observations:
+    """Corners (V, N, 2) of a board, NaN where not seen, with covariances (V, N, 2, 2) if given, as observations."""
+    spread = [None] * len(pixels) if covariance is None else covariance.flatten(-2)[..., [0, 1, 3]].tolist()
+    views = []
+    for i, (view, own) in enumerate(zip(pixels.tolist(), spread, strict=True)):
+        corners = tuple(None if u != u else (u, v) for u, v in view)
+        known = own and tuple(c and (a, b, d) for c, (a, b, d) in zip(corners, own, strict=True))
+        views.append(View(name=names[i] if names else f"{i:03d}", pixels=corners, covariance=known))
+    return Observations(board=board, image_size=size, views=tuple(views))
 
 
 def as_camera(lens: TruthLens) -> Camera:
