@@ -26,7 +26,7 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
-from kcal import Board, Landmarks, Observations, calibrate_camera
+from kcal import Board, Observations, calibrate_camera
 from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save_picture
 from kcal.sim.captures import PrintedBoard, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
@@ -36,6 +36,7 @@ from scripts.make_assets import ASSETS
 from scripts.paper.locate import SIDES
 from scripts.paper.locate import by_opencv as opencv_rig
 from scripts.shared.captures import capture_corners
+from scripts.shared.long_range import landmarks_of
 from scripts.shared.peer_lenses import calibrated
 from scripts.shared.timing import show
 from scripts.shared.traced import as_observations
@@ -84,13 +85,8 @@ def measured(draw: int) -> dict[str, Any]:
 def by_kcal(scene: DemoScene, seen: tuple[Observations, Observations], survey: NamedPoints) -> Tensor:
     """Positions (N, 3) of the targets by kcal's calibration, rig and localizer."""
     marks = scene.landmark_marks
-    landmarks = Landmarks(
-        names=survey.names,
-        points=survey.enu,
-        sigma=torch.full_like(survey.enu, scene.survey_sigma),
-        pixels=torch.stack([marks.left, marks.right], 1),
-        pixel_sigma=scene.mark_sigma,
-    )
+    pixels = torch.stack([marks.left, marks.right], 1)
+    landmarks = landmarks_of(survey.enu, pixels, scene.survey_sigma, scene.mark_sigma)
     with torch.no_grad():
         cameras = calibrate_camera(seen[0]).camera, calibrate_camera(seen[1]).camera
         found = localizer(cameras, landmarks, "prior")(scene.target_marks.true_left, scene.target_marks.true_right)

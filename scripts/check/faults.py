@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal import Baseline, KcalError, Landmarks, Observations, RigData, calibrate_camera, solve_rig
+from kcal import Baseline, KcalError, Observations, RigData, calibrate_camera, solve_rig
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens import vector_from_rotation
 from scripts.check.rig import BASELINE, NAMES, STRAIGHT, TRUTH, data, generator, landmarks
@@ -44,16 +44,11 @@ def of_landmarks(count: int, seed: int, wrong: bool = False) -> RigCase:
     whole = landmarks(generator(seed))
     points = whole.points[:count].clone()
     points[2] += OFF * wrong
-    few = Landmarks(
-        names=whole.names[:count],
-        points=points,
-        sigma=whole.sigma[:count],
-        pixels=whole.pixels[:count],
-        pixel_sigma=whole.pixel_sigma,
+    few = dataclasses.replace(
+        whole, names=whole.names[:count], points=points, sigma=whole.sigma[:count], pixels=whole.pixels[:count]
     )
-    return RigCase(
-        RigData(cameras=(TRUTH.left, TRUTH.right), names=NAMES, landmarks=few), whole.names[2] if wrong else ""
-    )
+    sources = RigData(cameras=(TRUTH.left, TRUTH.right), names=NAMES, landmarks=few)
+    return RigCase(sources, whole.names[2] if wrong else "")
 
 
 def with_baseline(kind: str, seed: int, sigma: float) -> RigCase:

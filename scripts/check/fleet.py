@@ -207,7 +207,7 @@ def missing_or_twice(output: Path, names: list[str]) -> int:
 def fleet(
     cameras: int = 1000, views: int = 6, every: int = 100, workers: int = 2, model: str = "opencv5",
     refine: str = "saddle",
-) -> Iterator[str]:  # fmt: skip
+) -> Lines:  # fmt: skip
     """A worker is killed after every so many pieces of work."""
     rows, failed = [], False
     with tempfile.TemporaryDirectory(prefix="kcal-fleet-") as name:

@@ -21,6 +21,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from scripts import make_sbom
 from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.sections import section
 from scripts.shared.timing import children_seconds
@@ -51,22 +52,12 @@ print(json.dumps([cv2.__version__, [detect_board(read_gray(path), board).pixels.
 """
 
 
-def needed(requirements: Iterable[str], extra: str = "") -> set[str]:
+def needed(requirements: Iterable[str]) -> set[str]:
     """Names of the packages that these need, with all that those need in turn."""
-    names: set[str] = set()
-    waiting = [(Requirement(text), extra) for text in requirements]
-    while waiting:
-        requirement, given = waiting.pop()
-        name = canonicalize_name(requirement.name)
-        if name in names or (requirement.marker and not requirement.marker.evaluate({"extra": given})):
-            continue
-        try:
-            told = importlib.metadata.requires(name) or []
-        except importlib.metadata.PackageNotFoundError:
-            raise SystemExit(f"{name} is not installed here; pip install -e '.[dev]'") from None
-        names.add(name)
-        waiting += [(Requirement(text), one) for text in told for one in requirement.extras or {""}]
-    return names
+    try:
+        return set(make_sbom.needed(map(Requirement, requirements)))
+    except importlib.metadata.PackageNotFoundError as missing:
+        raise SystemExit(f"{missing.name} is not installed here; pip install -e '.[dev]'") from None
 
 
 def megabytes(packages: Iterable[str]) -> float:

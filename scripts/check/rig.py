@@ -33,7 +33,7 @@ from kcal.locate import enu_from_cam
 from kcal.report import rig_figure, save_picture
 from kcal.rig import RigCovariance
 from kcal.watch.turned import drift_of_turns, measure_drift
-from scripts.shared.long_range import ORIGIN, RANGES, matches_of, rig
+from scripts.shared.long_range import ORIGIN, RANGES, landmarks_of, matches_of, rig, with_noise
 from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.sections import section
 from scripts.shared.timing import rms, share
@@ -77,14 +77,7 @@ def normal(shape: tuple[int, ...], draw: torch.Generator) -> Tensor:
 
 def landmarks(draw: torch.Generator, count: int = 12) -> Landmarks:
     points = spread(count, 100.0, 2600.0, draw)
-    pixels = seen(points)
-    return Landmarks(
-        names=tuple(f"post {i}" for i in range(1, count + 1)),
-        points=points + SURVEY * normal((count, 3), draw),
-        sigma=torch.full((count, 3), SURVEY, dtype=torch.float64),
-        pixels=pixels + MARK * normal((count, 2, 2), draw),
-        pixel_sigma=MARK,
-    )
+    return with_noise(landmarks_of(points, seen(points), SURVEY, MARK), draw)
 
 
 def summits(draw: torch.Generator, count: int = 20) -> Features:

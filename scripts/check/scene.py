@@ -46,7 +46,7 @@ from kcal.scene.refine import refine_matches
 from kcal.sim.captures import TrueRig, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM
-from scripts.shared.long_range import ORIGIN, matches_of
+from scripts.shared.long_range import ORIGIN, landmarks_of, matches_of, with_noise
 from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.terrain import Terrain, Weather
@@ -374,12 +374,7 @@ def landmarks(draw: torch.Generator) -> Landmarks:
     seen = (valid & RIG.left.inside(left) & RIG.right.inside(right)).nonzero()[:count, 0]
     pixels = torch.stack([left, right], 1)[seen]
     enu = points[seen] @ torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]], dtype=torch.float64)
-    survey = 0.02 * torch.randn(count, 3, dtype=torch.float64, generator=draw)
-    marks = MARK * torch.randn(count, 2, 2, dtype=torch.float64, generator=draw)
-    return Landmarks(
-        names=tuple(f"post {i}" for i in range(count)), points=enu + survey, sigma=torch.full_like(survey, 0.02),
-        pixels=pixels + marks, pixel_sigma=MARK,
-    )  # fmt: skip
+    return with_noise(landmarks_of(enu, pixels, 0.02, MARK), draw)
 
 
 def at_five_km(found: RigResult, draw: torch.Generator) -> tuple[Tensor, Tensor]:

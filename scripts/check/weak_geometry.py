@@ -20,7 +20,7 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.finding import sentences
 from kcal.locate import enu_from_cam
 from kcal.rig import RigCovariance
-from scripts.shared.long_range import ORIGIN, RANGES, rig
+from scripts.shared.long_range import ORIGIN, RANGES, landmarks_of, rig, with_noise
 from scripts.shared.page import Lines
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.timing import share
@@ -109,23 +109,9 @@ def drawn(kind: str, seed: int) -> tuple[Rig, Landmarks, Record]:
     (left, right), seen = pixels.unbind(-2), seen.all(-1)
     seen &= points[:, 2] > 30.0
     kept = seen.nonzero()[:count, 0]
-    exact = Landmarks(
-        names=tuple(f"post {i}" for i in range(len(kept))),
-        points=points[kept] @ LOOK,
-        sigma=torch.full((len(kept), 3), survey, dtype=torch.float64),
-        pixels=torch.stack([left, right], 1)[kept],
-        pixel_sigma=mark,
-    )
+    exact = landmarks_of(points[kept] @ LOOK, torch.stack([left, right], 1)[kept], survey, mark)
     head = {"kind": kind, "seed": seed, "baseline": baseline, "count": len(kept), "distance": distance}
     return truth, exact, head
-
-
-def noisy(exact: Landmarks, draw: Draw) -> Landmarks:
-    return dataclasses.replace(
-        exact,
-        points=exact.points + exact.sigma * draw.normal(*exact.points.shape),
-        pixels=exact.pixels + exact.pixel_sigma * draw.normal(*exact.pixels.shape),
-    )
 
 
 def judged(truth: Rig, found: RigResult, draw: Draw, widen: float = 1.0) -> tuple[list[float], list[float]]:
@@ -184,7 +170,7 @@ def one(kind: str, seed: int) -> Record:
     for number in range(DRAWS):
         draw = Draw(10_000 * FIRST + 1000 * seed + 10 * number + list(KINDS).index(kind))
         try:
-            found = unchecked(truth, noisy(exact, draw))
+            found = unchecked(truth, with_noise(exact, draw.generator))
         except KcalError as error:
             if not number:
                 return record | {"outcome": "refused", "said": str(error), "usable": False}

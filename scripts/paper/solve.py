@@ -116,7 +116,7 @@ class _Run:
                 for side, lens in self.true.items()
             }
             cameras = pair["left"][0], pair["right"][0]
-            self.result["located"][label] = judge(self.scene, by_kcal(self.scene, cameras))
+            self.result["located"][label] = judge(self.scene, by_kcal(cameras))
         self._keep()
 
     def _keep(self) -> None:
