@@ -126,7 +126,7 @@ def live(
     early, late = max(memory[: 2 * quarter]), max(memory[-quarter:])
 
     yield f"{hours:g} h of {rate:g} moments a second with {targets} targets, replayed as fast as it goes."
-    yield from [
+    rows: list[list[object]] = [
         ["", "found"],
         ["moments, positions", f"{moments:,}, {sum(seen.values()):,}"],
         ["malformed lines among them", malformed],
@@ -137,3 +137,4 @@ def live(
         ["50 tracks, one moment", share_of_core(costs[0])],
         ["the same, compiled", share_of_core(costs[1])],
     ]
+    yield from rows

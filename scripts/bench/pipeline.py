@@ -106,7 +106,8 @@ def gradients(lenses: tuple[str, ...] = tuple(LENSES)) -> Lines:
         f"{what}, {how}, ms" for what in ("100", PAIRS, f"{PAIRS} with gradients") for how in ("eager", "compiled")
     ]
     yield "Processor time of `Localizer`, one thread:"
-    yield from [heads, *rows]
+    yield heads
+    yield from rows
     camera = made["opencv5"][0].rig.left
     pixels, K, d = made["opencv5"][1], camera.matrix, camera.coefficients
     rays = camera.unproject(pixels)[0]
@@ -183,4 +184,5 @@ def latency(calls: int = 200, eager: bool = False) -> Lines:
         rows.append([count, *(milliseconds(call, calls) for call in work)])
     heads = ["objects", "localize, eager", *(["localize, compiled"] if not eager else []), "associate", "match"]
     yield "Milliseconds a call: median / 99th percentile (processor time, mean)."
-    yield from [heads, *rows]
+    yield heads
+    yield from rows

@@ -35,7 +35,7 @@ from kcal.lens.camera import Camera
 from kcal.sim.captures import LensLike, board_points, drawn_lens
 from scripts.shared.captures import PAPER_BOARD, capture_corners
 from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import Lines, table
+from scripts.shared.page import Line, Lines
 from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import LENSES, figures, quick
@@ -108,7 +108,7 @@ def measured(lens: LensLike, seen: Observations, options: CalibrationOptions) ->
 def traced(
     kept: Kept = NOT_KEPT, seeds: range = range(200, 203), lenses: tuple[str, ...] = LENSES,
     views: tuple[int, ...] = VIEWS, noise: tuple[float, ...] = SIGMAS, boards: tuple[str, ...] = BOARDS,
-) -> list[str]:  # fmt: skip
+) -> list[Line]:  # fmt: skip
     records = fits_of(kept, seeds, lenses, views, noise, boards, tuple(MODELS), False)
     cells: dict[tuple[Any, ...], dict[str, list[float]]] = {}
     for r in records:
@@ -131,8 +131,8 @@ def traced(
             means.append(f"{board} boards: geometric mean {mean:.2f}, worst {max(ratios):.2f}")
     return [
         f"Hybrid over the best of the others in each cell: {'; '.join(means)}. Cells with {SHOWN:g} px of noise:",
-        "",
-        *table(["board", "lens", "views", *MODELS, "ratio"], rows),
+        ["board", "lens", "views", *MODELS, "ratio"],
+        *rows,
     ]
 
 
@@ -152,7 +152,7 @@ def sigmas(
     kept: Kept = NOT_KEPT, seeds: range = range(200, 212), lenses: tuple[str, ...] = LENSES,
     views: tuple[int, ...] = (60, 30), noise: tuple[float, ...] = (0.03, 0.1, 0.2),
     boards: tuple[str, ...] = BOARDS, apart: bool = False,
-) -> list[str]:  # fmt: skip
+) -> list[Line]:  # fmt: skip
     """Predicted errors of the hybrid over true ones, and how often the truth is inside its ellipses.
 
     With `apart` each noise has views of its own.
@@ -177,8 +177,8 @@ def sigmas(
         f"{max(ratios):.2f}, each from {len(next(iter(cells.values())))} captures.",
         "",
         f"Truth inside the 95 % ellipses of the hybrid, seeds {', '.join(map(str, seeds))}:",
-        "",
-        *table(["board", "lens", "views", "where boards reached", "beyond", "captures"], rows),
+        ["board", "lens", "views", "where boards reached", "beyond", "captures"],
+        *rows,
     ]
 
 

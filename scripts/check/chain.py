@@ -38,7 +38,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.sim.captures import TrueRig
 from scripts.check.chain_rig import How, judge, targets, true_rig
 from scripts.shared.long_range import RANGES
-from scripts.shared.page import table
+from scripts.shared.page import Line, table
 from scripts.shared.peer_lenses import opencv
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.timing import share, show
@@ -63,7 +63,7 @@ def inside(records: Records, i: int | None) -> str:
     return share(shares) if len(shares) > 1 else f"{100 * shares[0]:.1f}"
 
 
-def tables(records: Records) -> list[str]:
+def tables(records: Records) -> list[Line]:
     """Errors and coverage of all chains, and what failed."""
     rows: list[list[str]] = []
     chains = _values(records, "chain", sort=False)
@@ -80,7 +80,7 @@ def tables(records: Records) -> list[str]:
         "calibration, m", "total / bound", "in 95 %, %", "at each range, %", "without ray", "failed",
     ]  # fmt: skip
     draws = "Draws of lenses, boards and corners, by seed: " + ", ".join(map(str, _values(records, "draw"))) + "."
-    return [*table(heads, rows), "", draws]
+    return [heads, *rows, draws]
 
 
 def _cells(records: Records) -> list[str]:
@@ -196,7 +196,7 @@ def whole_chain(
     kept: Kept = NOT_KEPT, seeds: range = range(300, 310), boards: tuple[str, ...] = ("exact", "printed"),
     pupils: tuple[float, ...] = (0.0, 1.0, 3.0), noise: tuple[float, ...] = (0.05,),
     chains: tuple[str, ...] = tuple(CHAINS), marks: int = 24, exact: int = 4,
-) -> list[str]:  # fmt: skip
+) -> list[Line]:  # fmt: skip
     """So many draws of landmarks and marks for each; of these `exact` also without noise, for the lenses alone."""
     work = torch.no_grad()(functools.partial(cell, chains=chains, marks=marks, exact=exact))
     records = kept.records(itertools.product(seeds, boards, pupils, noise), work, lambda _: "done")

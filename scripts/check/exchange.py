@@ -26,7 +26,7 @@ from kcal.io.formats import FORMATS
 from kcal.lens import CameraCalibration, LensModel, camera_difference, export_cameras, import_cameras
 from kcal.lens.model import HybridForm, radius_over_angle
 from kcal.lens.zernike import ZernikeModes
-from scripts.check.foreign_lenses import by_formula
+from scripts.check.foreign_lenses import by_formula, growth, tangential
 from scripts.shared.children import interpreter
 from scripts.shared.page import merged, table
 from scripts.shared.sections import section
@@ -131,15 +131,11 @@ def by_nerfstudio(path: Path, points: np.ndarray) -> np.ndarray:
 
 def by_matlab(path: Path, points: np.ndarray) -> np.ndarray:
     c = loadmat(path, simplify_cells=True)["cameraParams"]
-    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
-    k1, k2, k3 = [*np.atleast_1d(c["RadialDistortion"]), 0.0][:3]
-    p1, p2 = c["TangentialDistortion"]
-    s = x * x + y * y
-    radial = 1 + k1 * s + k2 * s**2 + k3 * s**3
-    xd = x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x)
-    yd = y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y
+    x, y = (points[:, :2] / points[:, 2:]).T
+    grown = growth(x, y, [*np.atleast_1d(c["RadialDistortion"]), 0.0][:3])
+    across, down = tangential(x, y, *c["TangentialDistortion"])
     # MATLAB's first pixel is (1, 1).
-    return np.stack([xd, yd, np.ones_like(xd)], 1) @ np.array(c["K"]).T[:, :2] - 1.0
+    return np.stack([x * grown + across, y * grown + down, np.ones_like(x)], 1) @ np.array(c["K"]).T[:, :2] - 1.0
 
 
 def by_opensfm(path: Path, points: np.ndarray) -> np.ndarray:
@@ -340,12 +336,15 @@ def by_numpy(path: Path, points: np.ndarray) -> np.ndarray:
     with np.load(path) as file:
         names, values = file["parameters_0"].tolist(), file["mean_0"]
     assert names[:4] == ["fx", "fy", "cx", "cy"]
-    matrix = np.array([[values[0], 0, values[2]], [0, values[1], values[3]], [0, 0, 1]])
-    return opencv_formula(points, matrix, values[4:], False)
+    return by_vector(values, points)
 
 
 def by_ceres(path: Path, points: np.ndarray) -> np.ndarray:
-    values = np.array(json.loads(path.read_text())["cameras"][0]["mean"])
+    return by_vector(np.array(json.loads(path.read_text())["cameras"][0]["mean"]), points)
+
+
+def by_vector(values: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """By fx, fy, cx, cy and OpenCV's coefficients."""
     matrix = np.array([[values[0], 0, values[2]], [0, values[1], values[3]], [0, 0, 1]])
     return opencv_formula(points, matrix, values[4:], False)
 
@@ -526,11 +525,9 @@ def agisoft(folder: Path) -> tuple[Path, np.ndarray, str, Callable[[np.ndarray],
     )  # fmt: skip
 
     def project(points: np.ndarray) -> np.ndarray:
-        x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
-        r2 = x * x + y * y
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
-        across = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
-        down = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+        x, y = (points[:, :2] / points[:, 2:]).T
+        grown, (across, down) = growth(x, y, [k1, k2, k3, k4]), tangential(x, y, p2, p1)
+        across, down = x * grown + across, y * grown + down
         return np.stack([640 + cx + across * f - 0.5, 360 + cy + down * f - 0.5], 1)
 
     order = ("f", "f", "cx", "cy", "k1", "k2", "p2", "p1", "k3", "k4")

@@ -28,6 +28,7 @@ from typing import NamedTuple
 import psutil
 
 from scripts.shared.memory import peak_megabytes
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 from scripts.shared.small_photographs import COLUMNS, HEIGHT, ROWS, WIDTH, photographs
 from scripts.shared.timing import children_seconds

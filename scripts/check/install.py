@@ -22,7 +22,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from scripts import make_sbom
-from scripts.shared.page import DOCS, Lines, table
+from scripts.shared.page import DOCS, Line, Lines, table
 from scripts.shared.sections import section
 from scripts.shared.timing import children_seconds
 
@@ -79,7 +79,7 @@ def seconds(words: list[str], path: str, runs: int) -> float:
 
 
 @section("other-programs.md", "extras", runs=1)
-def extras(runs: int = 9) -> list[str]:
+def extras(runs: int = 9) -> list[Line]:
     """Size of each extra, and CPU seconds to start with all of them and with none."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     base = needed(project["dependencies"])
@@ -100,7 +100,7 @@ def extras(runs: int = 9) -> list[str]:
         for said, words in _STARTS.items():
             times = [seconds(words, path, runs) for path in (str(ROOT), f"{folder}{os.pathsep}{ROOT}")]
             starts.append([said, *(f"{one:.2f}" for one in times)])
-    return [*lines, "", *table(["start", "with all extras, CPU s", "without"], starts)]
+    return [*lines, ["start", "with all extras, CPU s", "without"], *starts]
 
 
 @section("other-programs.md", "opencv packages", packages=("opencv-python-headless==5.0.0.93",), images=1)

@@ -39,7 +39,7 @@ from kcal.stars.night import Attitude, NamedStars, SkyView, fit_attitude, name_s
 from kcal.stars.sky import Air, StarCatalog, celestial_directions, identify, observed_directions
 from scripts.check.chain_rig import ENU_FROM_RIG, Targets, landmarks, targets, true_rig
 from scripts.shared.long_range import ORIGIN, RANGES, matches_of
-from scripts.shared.night_scenes import PLACE, TIME, lens_trials, star_images
+from scripts.shared.night_scenes import PLACE, TIME, lens_trials, masts, scattered, star_images
 from scripts.shared.page import Lines, merged, table
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import NOT_KEPT, Kept, section
@@ -182,17 +182,9 @@ def data_of(made: Lenses, case: Case, seed: int) -> RigData:
     features = None
     positions: tuple[MeasuredPosition, ...] = ()
     if case.named:
-        positions = tuple(
-            MeasuredPosition(
-                camera=c, point=center[c] + torch.from_numpy(draw.normal(0, MAST, 3)),
-                sigma=torch.full((3,), MAST).double(),
-            )
-            for c in (0, 1)
-        )  # fmt: skip
+        positions = masts(center, MAST, draw)
     else:
-        way = draw.uniform((-0.4, -0.2), (0.4, 0.2), (MATCHES, 2))
-        rays = torch.nn.functional.pad(torch.from_numpy(way), (0, 1), value=1.0)
-        left, right = rig(torch.from_numpy(draw.uniform(100, 1500, (MATCHES, 1))) * rays)[0].unbind(-2)
+        left, right = rig(scattered(MATCHES, draw))[0].unbind(-2)
         marks = torch.stack([left, right], 1)
         features = matches_of(marks + torch.from_numpy(draw.normal(0, MARK, marks.shape)), pixel_sigma=MARK)
     return dataclasses.replace(data, stars=night(rig, cameras, case, draw), features=features, positions=positions)

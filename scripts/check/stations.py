@@ -31,7 +31,7 @@ from torch import Tensor
 from kcal import Camera, Localizer, Rig
 from kcal.locate.stereo import Localization, PositionStatus
 from kcal.locate.views import fit_views
-from scripts.shared.page import DOCS, Lines, table
+from scripts.shared.page import DOCS, Line, Lines, table
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import section
 from scripts.shared.station_scenes import drawn_errors, marks, ring, targets
@@ -284,7 +284,7 @@ def _contains(polygon: np.ndarray, point: np.ndarray) -> bool:
 
 @section("stations.md", "real")
 @torch.no_grad()
-def real() -> list[str]:
+def real() -> list[Line]:
     """Table for the four cameras and the walking person: two cameras' points seen by the others."""
     data = np.load(data_folder() / "stations" / "pose2sim.npz")
     cameras = []
@@ -324,7 +324,7 @@ def real() -> list[str]:
     note = f"{len(pixels)} joints; noise of a mark along an axis {sigma:.2f} px, from the joints that all four see; "
     offsets = ", ".join(f"{name} {one:.1f}" for name, one in zip(rig.names, off, strict=True))
     note += f"mean offset of a camera's marks: {offsets} px."
-    return [note, "", *table(heads, rows)]
+    return [note, heads, *rows]
 
 
 @section("stations.md", "picture")

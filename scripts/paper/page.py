@@ -168,7 +168,7 @@ def _limits(name: str, runs: list[dict]) -> str:
     return text
 
 
-def table_1(results: Results) -> list[str]:
+def table_1(results: Results) -> list[Line]:
     paper = [("Surveillance camera", 0.22, 0.20), ("Surveillance camera", 0.24, 0.21)]
     paper += [("Machine vision lens", 0.07, 0.07), ("Webcam", 0.10, 0.08)]
     sources = [("glass", "left"), ("glass", "right"), ("vision", "left"), ("plastic", "left")]
@@ -184,8 +184,8 @@ def table_1(results: Results) -> list[str]:
         ratios.append(ours / median(b for _, b in pairs))
         rows.append([f"{title}: {KINDS[name].title}, {side}", theirs, ours, other, own])
     return [
-        *table(["camera", "paper, OpenCV", "paper, own", "OpenCV here", "kcal here"], rows),
-        "",
+        ["camera", "paper, OpenCV", "paper, own", "OpenCV here", "kcal here"],
+        *rows,
         f"In {smaller} of {total} calibrations kcal's residual is the smaller one. The paper's own residuals are "
         f"{min(ratios):.1f} to {max(ratios):.1f} times those of kcal here. Most of a residual is the board: the same "
         f"corners leave {min(whole):.3f} to {max(whole):.3f} px (medians of the rows) once kcal's default camera has "
@@ -193,7 +193,7 @@ def table_1(results: Results) -> list[str]:
     ]
 
 
-def table_2() -> list[str]:
+def table_2() -> list[Line]:
     paper = {2.0: (125.0, 3125.0), 1.0: (62.5, 1562.5), 0.5: (31.25, 781.25), 0.1: (6.25, 156.25)}
     rows = []
     for disparity, (near, far) in paper.items():
@@ -207,15 +207,15 @@ def table_2() -> list[str]:
         float(part[0]) for part in range_errors(planned_rig(), [5000.0], BudgetErrors(disparity_px=2.0))["disparity"]
     )
     return [
-        *table(["Δd, px", "paper, 1 km", "slope", "exact", "paper, 5 km", "slope", "exact"], rows),
-        "",
+        ["Δd, px", "paper, 1 km", "slope", "exact", "paper, 5 km", "slope", "exact"],
+        *rows,
         "The paper's formula, ΔZ = Z² Δd / (f B) with f B = 16 000 px m, is the slope at the true point, and kcal's "
         f"slope is the same. Exactly, the error is not symmetric: 2 px at 5 km put a point {-near / 1000:.1f} km too "
         f"near or {far / 1000:.1f} km too far.",
     ]
 
 
-def table_3(results: Results) -> list[str]:
+def table_3(results: Results) -> list[Line]:
     heads = [f"{name}, {side}" for name in results for side in ("right", "left")]
     rows, gains = [], []
     for label, paper in TABLE_3.items():
@@ -233,15 +233,15 @@ def table_3(results: Results) -> list[str]:
         ]
         gains.append(f"{middle(gain, 1)} % ({name})")
     return [
-        *table(["coefficients", "paper, right", "left", *heads], rows),
-        "",
+        ["coefficients", "paper, right", "left", *heads],
+        *rows,
         f"From 14 to 20 coefficients the paper's residual falls by 0.1 %; here by {', '.join(gains)}. A flat table "
         "says that something else than the lens is left: here it is the print of the board, which no coefficient "
         "describes. The paper's 0.2 px may be of the same kind.",
     ]
 
 
-def distance(results: Results) -> list[str]:
+def distance(results: Results) -> list[Line]:
     def worst(run: dict, label: str) -> float:
         return max(reprojection(run, label))
 
@@ -249,7 +249,7 @@ def distance(results: Results) -> list[str]:
     rows += [
         [name, *(number(median(worst(run, m) for run in runs), 2) for m in SHOWN)] for name, runs in results.items()
     ]
-    lines = ["Largest reprojection error of the seven points, pixels:", "", *table(["", *SHOWN], rows), ""]
+    lines: list[Line] = ["Largest reprojection error of the seven points, pixels:", ["", *SHOWN], *rows, ""]
     rows = []
     for name, runs in results.items():
         for label in SHOWN:
@@ -262,7 +262,7 @@ def distance(results: Results) -> list[str]:
     return [*lines, *table(["camera", "model", *DISTANCES, "%"], rows)]
 
 
-def choice(results: Results) -> list[str]:
+def choice(results: Results) -> list[Line]:
     rows: list[list[str]] = []
     gains: list[float] = []
     for name, runs in results.items():
@@ -283,8 +283,8 @@ def choice(results: Results) -> list[str]:
         rows.append([name, *(middle(values, 2) for values in scores.values())])
     heads = ["", "held-out views", "check points", "the seven points (leak)", "hybrid", "always 20", "always 14"]
     return [
-        *table(heads, rows),
-        "",
+        heads,
+        *rows,
         "The third column chooses by the seven points on which it is scored, so its score is the lowest possible. "
         f"It is {middle(gains, 2)} percentage points below the first column: this is the bias of the paper's choice.",
     ]

@@ -186,6 +186,22 @@ BASELINE = 10.0  # m
 LOOKS = ((40.0, 12.0, 1.0), (41.5, 12.5, -0.5))
 
 
+def masts(center: Tensor, sigma: float, draw: np.random.Generator) -> tuple[MeasuredPosition, ...]:
+    """The measured positions of cameras whose centers (C, 3) are known."""
+    spread = torch.full((3,), sigma).double()
+    return tuple(
+        MeasuredPosition(camera=c, point=at + torch.from_numpy(draw.normal(0, sigma, 3)), sigma=spread)
+        for c, at in enumerate(center)
+    )
+
+
+def scattered(count: int, draw: np.random.Generator) -> Tensor:
+    """Points (N, 3) 100 to 1500 m ahead of a camera."""
+    way = draw.uniform((-0.4, -0.2), (0.4, 0.2), (count, 2))
+    rays = torch.nn.functional.pad(torch.from_numpy(way), (0, 1), value=1.0)
+    return torch.from_numpy(draw.uniform(100, 1500, (count, 1))) * rays
+
+
 def star_rig(
     camera: Camera,
     *,
@@ -250,23 +266,16 @@ def star_rig(
     )
     features = None
     if matches:
-        way = draw.uniform((-0.4, -0.2), (0.4, 0.2), (matches, 2))
-        rays = torch.nn.functional.pad(torch.from_numpy(way), (0, 1), value=1.0)
-        points = torch.from_numpy(draw.uniform(100, 1500, (matches, 1))) * rays @ rotation[0]
+        points = scattered(matches, draw) @ rotation[0]
         at = torch.stack([camera.project((points - c) @ r.T)[0] for r, c in zip(rotation, center, strict=True)], 1)
         features = matches_of(at + torch.from_numpy(draw.normal(0, 0.1, at.shape)), pixel_sigma=0.1)
-    places = [
-        MeasuredPosition(
-            camera=c, point=center[c] + torch.from_numpy(draw.normal(0, 0.01, 3)), sigma=torch.full((3,), 0.01).double()
-        )
-        for c in (0, 1)
-    ]
+    places = masts(center, 0.01, draw)
     data = RigData(
         cameras=(camera, camera),
         names=("left", "right"),
         stars=stars,
         features=features,
         baselines=(Baseline(first=0, second=1, length=BASELINE + draw.normal(0, 0.002), sigma=0.002),),
-        positions=tuple(places) if positions else (),
+        positions=places if positions else (),
     )
     return data, rotation, center

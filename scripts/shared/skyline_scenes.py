@@ -254,7 +254,6 @@ def _land(
     return (80.0 + 22.0 * texture) * clear + sky * (1.0 - clear)
 
 
-Floats = NDArray[np.float64]
 HERE = (47.0, 11.0)
 # Meters: above the ground, and how far the terrain and its rasters go.
 MAST, FARTHEST, REACH = 12.0, 11_000.0, 12_000.0
