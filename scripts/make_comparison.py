@@ -106,11 +106,7 @@ def turned(scene: DemoScene, enu: Tensor) -> Tensor:
     angle = math.radians(scene.heading_deg)
     east, north = enu[:, 0], enu[:, 1]
     return torch.stack(
-        [
-            east * math.cos(angle) - north * math.sin(angle),
-            east * math.sin(angle) + north * math.cos(angle),
-        ],
-        -1,
+        [east * math.cos(angle) - north * math.sin(angle), east * math.sin(angle) + north * math.cos(angle)], -1
     )
 
 

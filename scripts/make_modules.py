@@ -110,10 +110,7 @@ PLACES = torch.tensor([[4.0, -8.0, 160.0], [-30.0, 14.0, 120.0], [2.0, 2.0, 40.0
 def pairs() -> Values:
     """Marked pixels of three points in both images."""
     left, right = rig()(PLACES)[0].unbind(-2)
-    return {
-        "pixels": left.detach() + 0.1 * noise(3, 2),
-        "other": right.detach() + 0.1 * noise(3, 2, seed=1),
-    }
+    return {"pixels": left.detach() + 0.1 * noise(3, 2), "other": right.detach() + 0.1 * noise(3, 2, seed=1)}
 
 
 def pair_cov() -> Tensor:

@@ -75,11 +75,7 @@ class Scene:
         return render_light(self.lens, pose, self.extent, _look(look)).numpy()
 
     def draw(
-        self,
-        generator: torch.Generator,
-        fill: tuple[float, float] = (0.45, 0.85),
-        tilt: float = 40.0,
-        **look: float,
+        self, generator: torch.Generator, fill: tuple[float, float] = (0.45, 0.85), tilt: float = 40.0, **look: float
     ) -> Shown:
         """The board in a pose that is drawn."""
         pose = self.pose(generator, fill, tilt)

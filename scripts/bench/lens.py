@@ -65,10 +65,7 @@ def peers_project(camera: Camera, points: Tensor) -> list[Call]:
     array, K, d, zero = points.numpy(), matrix.numpy(), lens.numpy().copy(), np.zeros(3)
     # kornia takes the pixels of an undistorted camera, so that the division by depth is done beforehand.
     flat = points[:, :2] / points[:, 2:] * camera.focal + camera.center
-    return [
-        lambda: cv2.projectPoints(array, zero, zero, K, d)[0],
-        lambda: distort_points(flat, matrix, lens),
-    ]
+    return [lambda: cv2.projectPoints(array, zero, zero, K, d)[0], lambda: distort_points(flat, matrix, lens)]
 
 
 def peers_unproject(camera: Camera, pixels: Tensor) -> list[Call]:
@@ -389,10 +386,7 @@ def _row(name: str, camera: Camera, undistort: Undistort, image: torch.Tensor, r
     # OpenCV's images have their channels last.
     array = np.ascontiguousarray(image[0].permute(1, 2, 0).squeeze(-1).numpy())
     matrix, lens = camera.matrix[None].to(torch.float32), camera.coefficients[None].to(torch.float32)
-    calls: list[Call] = [
-        lambda: undistort(image),
-        lambda: cv2.remap(array, maps.map_x, maps.map_y, cv2.INTER_LINEAR),
-    ]
+    calls: list[Call] = [lambda: undistort(image), lambda: cv2.remap(array, maps.map_x, maps.map_y, cv2.INTER_LINEAR)]
     if image.is_floating_point():
         calls.append(lambda: undistort_image(image, matrix, lens))
     found = times(calls, rounds)

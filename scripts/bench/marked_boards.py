@@ -179,10 +179,7 @@ CHARUCO: dict[str, Detector] = {
     "kcal": own,
     "CharucoDetector, tryRefineMarkers, SUBPIX": charuco(cv2.aruco.CORNER_REFINE_SUBPIX, again=True),
 }
-GRID: dict[str, Detector] = {
-    "kcal": own,
-    "ArucoDetector, APRILTAG": aruco_grid(cv2.aruco.CORNER_REFINE_APRILTAG),
-}
+GRID: dict[str, Detector] = {"kcal": own, "ArucoDetector, APRILTAG": aruco_grid(cv2.aruco.CORNER_REFINE_APRILTAG)}
 TAGGED: dict[str, Detector] = dict(CHARUCO)
 if HAS_APRILTAG:
     TAGGED["AprilTag, CharucoDetector"] = charuco_of_apriltag

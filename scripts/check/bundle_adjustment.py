@@ -211,10 +211,7 @@ def cases(seed: int) -> dict[str, tuple[Project, Camera]]:
     views = observed(simulate(VIEWS, plain, noise=0.2, seed=seed)["pixels"].tolist())
     held = calibrate_camera(views, CalibrationOptions(model="opencv4")).camera
     case = simulated(3 * seed + 1, VIEWS, 0.1, by_hand=False)
-    return {
-        "opencv4": (plain.project, held),
-        "traced lens": (case.lens.project, calibrate_camera(case.seen).camera),
-    }
+    return {"opencv4": (plain.project, held), "traced lens": (case.lens.project, calibrate_camera(case.seen).camera)}
 
 
 @section("other-programs.md", "bundle adjustment", seeds=range(1))

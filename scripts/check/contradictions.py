@@ -21,18 +21,7 @@ from kcal.calibrate.rig.pairs import paired_boards
 from kcal.calibrate.rig.problem import RigSolution
 from kcal.finding import Finding
 from kcal.lens import rotation_from_vector, vector_from_rotation
-from scripts.check.rig import (
-    MARK,
-    NAMES,
-    STRAIGHT,
-    TRUTH,
-    generator,
-    landmarks,
-    normal,
-    seen,
-    spread,
-    tape,
-)
+from scripts.check.rig import MARK, NAMES, STRAIGHT, TRUTH, generator, landmarks, normal, seen, spread, tape
 from scripts.shared.long_range import matches_of
 from scripts.shared.page import table
 from scripts.shared.sections import section

@@ -246,10 +246,7 @@ def fleet(
         with cluster(folder, workers) as dask:
             second = batch(source, folder / "resumed", *options, on=dask, every=every)
         add(
-            "Dask, also its scheduler, then continued",
-            folder / "resumed",
-            [first, second],
-            children_seconds() - before,
+            "Dask, also its scheduler, then continued", folder / "resumed", [first, second], children_seconds() - before
         )
     yield from [HEAD, *rows]
     yield (

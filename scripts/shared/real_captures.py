@@ -18,10 +18,7 @@ from scripts.shared import wide_lens
 from scripts.shared.wide_lens import data_folder
 
 # Folders of images, and their boards. The squares of gloworm960 are not known; no figure depends on them.
-FOLDERS = {
-    "pi640": Board(columns=7, rows=7, square=0.0254),
-    "gloworm960": Board(columns=8, rows=6, square=0.0254),
-}
+FOLDERS = {"pi640": Board(columns=7, rows=7, square=0.0254), "gloworm960": Board(columns=8, rows=6, square=0.0254)}
 CACHE = Path(tempfile.gettempdir(), "kcal-ordinary-corners")
 STEREO_BOARD = Board(columns=9, rows=6, square=0.025)
 
