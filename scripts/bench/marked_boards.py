@@ -13,7 +13,7 @@ import functools
 import importlib.util
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import cv2
@@ -42,7 +42,7 @@ from scripts.bench.hard_boards import (
     shaded,
     small,
 )
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 
 HAS_APRILTAG = importlib.util.find_spec("pupil_apriltags") is not None
@@ -211,18 +211,15 @@ def score(find: Detector, images: Iterable[Picture], board: Board) -> str:
 
 
 @section("corners.md", "marked boards", images=1, kinds=1)
-def marked_boards(images: int = 10, kinds: int = len(KINDS)) -> Iterator[str]:
+def marked_boards(images: int = 10, kinds: int = len(KINDS)) -> Lines:
     """Rendered images of each kind."""
     limit_threads(1)
     if not HAS_APRILTAG:
         yield "AprilTag's own library is left out: `pip install --target DIR pupil-apriltags`, DIR in PYTHONPATH."
     for name, detectors in BOARDS:
         board = Board.parse(name, "30mm")
-        yield from ["", f"`{name}`:", ""]
-        yield from table(["", *detectors], _rows(board, detectors, images, kinds))
-
-
-def _rows(board: Board, detectors: dict[str, Detector], images: int, kinds: int) -> Iterator[list[str]]:
-    for kind in KINDS[:kinds]:
-        some = list(pictures(kind, images, Marked(board)))
-        yield [kind.__name__, *(score(find, some, board) for find in detectors.values())]
+        yield f"`{name}`:"
+        yield ["", *detectors]
+        for kind in KINDS[:kinds]:
+            some = list(pictures(kind, images, Marked(board)))
+            yield [kind.__name__, *(score(find, some, board) for find in detectors.values())]

@@ -28,7 +28,7 @@ from kcal.lens.model import HybridForm, radius_over_angle
 from kcal.lens.zernike import ZernikeModes
 from scripts.check.foreign_lenses import by_formula, growth, tangential
 from scripts.shared.children import interpreter
-from scripts.shared.page import merged, table
+from scripts.shared.page import Lines, merged, table
 from scripts.shared.sections import section
 
 POINTS = 10_000
@@ -163,11 +163,8 @@ def by_multical(path: Path, points: np.ndarray) -> np.ndarray:
     return opencv_formula(points, np.array(camera["K"]), np.array(camera["dist"]), False)
 
 
-def exact_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> list[list[str]]:
+def exact_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> Iterator[list[str]]:
     """For each format, over the models that it holds: largest error of the peer, and of the way back to kcal."""
-    from kcal.io.formats import FORMATS
-
-    rows = []
     for format_name, (file, reader, project) in readers.items():
         errors = []
         for model in FORMATS[format_name].models:
@@ -180,14 +177,11 @@ def exact_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> li
             again = np.abs(back.project(torch.from_numpy(points))[0].numpy() - pixels).max()
             errors.append((error, again))
         worst = (f"{max(column):.1e}" for column in zip(*errors, strict=True))
-        rows.append([format_name, ", ".join(FORMATS[format_name].models), reader, *worst])
-    return rows
+        yield [format_name, ", ".join(FORMATS[format_name].models), reader, *worst]
 
 
 def fitted_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> list[list[str]]:
     """Lenses that formats do not hold: the stated maximum, and that of 10,000 points by the peer's reader."""
-    from kcal.io.formats import FORMATS
-
     rows = []
     subjects = {"hybrid, 72°": hybrid_camera(0.9, 36.0), "hybrid, 150°": hybrid_camera(0.2, 75.0)}
     for label, camera in (*subjects.items(), ("opencv14", sample_camera("opencv14"))):
@@ -212,9 +206,8 @@ def fitted_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> l
     return rows
 
 
-def difference_rows(folder: Path) -> list[list[str]]:
+def difference_rows(folder: Path) -> Iterator[list[str]]:
     """`camera_difference` beside mrcal's on the same two files."""
-    rows = []
     for scale in (0.1, 1.0, 10.0):
         cameras = []
         for i in range(2):
@@ -232,8 +225,7 @@ def difference_rows(folder: Path) -> list[list[str]]:
             errors = [np.abs(frames.shift.numpy() - found["fixed"]).max()]
             errors += [np.abs(each.shift.numpy() - found["turned"]).max() for each in (same, own)]
             rms = float(np.sqrt((found["turned"] ** 2).sum(-1).mean()))
-        rows.append([f"{own.rms:.3f}", f"{rms:.3f}", *(f"{error:.1e}" for error in errors)])
-    return rows
+        yield [f"{own.rms:.3f}", f"{rms:.3f}", *(f"{error:.1e}" for error in errors)]
 
 
 Reader = tuple[str, str, Project]
@@ -264,25 +256,23 @@ def readers_of() -> dict[str, Reader]:
 def formats() -> Iterator[str]:
     heads = ["format", "models", "reader and projection", "peer, px", "back in kcal, px"]
     with tempfile.TemporaryDirectory() as name:
-        rows = exact_rows(readers_of(), Path(name))
-    return merged("other-programs.md", "formats", heads, rows)
+        return merged("other-programs.md", "formats", heads, exact_rows(readers_of(), Path(name)))
 
 
 @section("other-programs.md", "refitted")
 def refitted() -> Iterator[str]:
     heads = ["lens", "format", "fitted", "RMS, px", "stated maximum, px", "of 10,000 points; within"]
     with tempfile.TemporaryDirectory() as name:
-        rows = fitted_rows(readers_of(), Path(name))
-    return merged("other-programs.md", "refitted", heads, rows, keys=2)
+        return merged("other-programs.md", "refitted", heads, fitted_rows(readers_of(), Path(name)), keys=2)
 
 
 @section("other-programs.md", "difference")
-def difference() -> Iterator[str]:
+def difference() -> Lines:
     if not interpreter("mrcal"):
         raise SystemExit("KCAL_MRCAL names an interpreter that has mrcal")
-    heads = ["kcal, RMS px", "mrcal, RMS px", "equal frames, px", "mrcal's turn, px", "own turns, px"]
+    yield ["kcal, RMS px", "mrcal, RMS px", "equal frames, px", "mrcal's turn, px", "own turns, px"]
     with tempfile.TemporaryDirectory() as name:
-        return table(heads, difference_rows(Path(name)))
+        yield from difference_rows(Path(name))
 
 
 HEADS = ["program", "direction", "lens", "σ", "pupil", "board", "largest error, px", "reader"]

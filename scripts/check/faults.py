@@ -22,7 +22,7 @@ from kcal import Baseline, KcalError, Observations, RigData, calibrate_camera, s
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens import vector_from_rotation
 from scripts.check.rig import BASELINE, NAMES, STRAIGHT, TRUTH, data, generator, landmarks
-from scripts.shared.page import Lines, table
+from scripts.shared.page import Lines
 from scripts.shared.real_captures import load, names
 from scripts.shared.sections import section
 from scripts.shared.simulated import simulated
@@ -94,10 +94,7 @@ def contained(found: RigResult) -> list[bool]:
 
 @section("rig.md", "faults", seeds=range(1))
 def of_rigs(seeds: range = range(20)) -> Lines:
-    return table(["rigs", "refused", "named", "plain", "left out", "contained"], _rig_rows(seeds))
-
-
-def _rig_rows(seeds: range) -> Iterator[list[object]]:
+    yield ["rigs", "refused", "named", "plain", "left out", "contained"]
     for kind, make in RIGS.items():
         refused = named = plain = out = 0
         inside: list[bool] = []

@@ -156,24 +156,6 @@ def visible_keypoints(pair: ImagePair, moment: int, weather: Weather) -> int:
     return int((inside & same & ~moving).sum())
 
 
-@section("scene.md", "matches", conditions=("clear noon",))
-@torch.no_grad()
-def matches(conditions: tuple[str, ...] = tuple(CONDITIONS)) -> Iterator[str]:
-    """Matches under several conditions against the truth."""
-    heads = [
-        "condition",
-        "by",
-        "matches",
-        "wrong",
-        "off the line",
-        "of visible",
-        "RMS across, px",
-        "over its σ",
-        "CPU s",
-    ]
-    yield from table(heads, match_rows(conditions))
-
-
 def told(condition: str, by: str, found: Judged, seconds: float) -> list[object]:
     sigmas = "" if math.isnan(found.sigmas) else f"{found.sigmas:.2f}"
     return [
@@ -183,7 +165,11 @@ def told(condition: str, by: str, found: Judged, seconds: float) -> list[object]
     ]  # fmt: skip
 
 
-def match_rows(conditions: tuple[str, ...]) -> Iterator[list[object]]:
+@section("scene.md", "matches", conditions=("clear noon",))
+@torch.no_grad()
+def matches(conditions: tuple[str, ...] = tuple(CONDITIONS)) -> Lines:
+    """Matches under several conditions against the truth."""
+    yield ["condition", "by", "matches", "wrong", "off the line", "of visible", "RMS across, px", "over its σ", "CPU s"]
     for condition, weathers in ((name, CONDITIONS[name]) for name in conditions):
         # The first last: its pictures are then at hand.
         pairs = [photographed(SCENE, moment, weathers[moment - 1]) for moment in (3, 2, 1)][::-1]

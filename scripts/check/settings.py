@@ -40,7 +40,15 @@ VIEWS, NOISE = 8, 0.1
 GAP, ZOOM = 3, 0.3
 # Distance that the sensor moves with focus, in that unit.
 FOCUS = 0.054
-WAYS = ("five", "three", "nearest", "opencv", "calibrated", "opencv there")
+# Ways to a camera, and what they are called.
+WAYS = {
+    "five": "interpolated from five",
+    "three": "interpolated from three",
+    "nearest": "nearest of five",
+    "opencv": "OpenCV-5, parameters linear",
+    "calibrated": "calibrated at its setting",
+    "opencv there": "OpenCV-5 at its setting",
+}
 
 
 def lens_at(kind: str, setting: float, seed: int) -> TruthLens:
@@ -146,19 +154,11 @@ def _root(draws: list[dict[str, Any]], way: str, what: str) -> float:
 
 def lines(records: list[Record], noises: int) -> Lines:
     """The table of the page."""
-    names = {
-        "five": "interpolated from five",
-        "three": "interpolated from three",
-        "nearest": "nearest of five",
-        "opencv": "OpenCV-5, parameters linear",
-        "calibrated": "calibrated at its setting",
-        "opencv there": "OpenCV-5 at its setting",
-    }
     yield ["", "camera", "error px, RMS", "σ px", "in 95 %", "σ of the curve px, median", "CPU s", "lenses x noises"]
     for kind in dict.fromkeys(record["key"][0] for record in records):
         own = [record for record in records if record["key"][0] == kind]
         draws = [draw for record in own for draw in record["draws"]]
-        for way, name in names.items():
+        for way, name in WAYS.items():
             stated = "inside" in draws[0][way]
             curve = "cpu" in draws[0][way]
             yield [

@@ -36,7 +36,7 @@ from kcal.stars import star_source
 from kcal.stars.detect import DetectedStars, detect_stars, read_night, time_of
 from kcal.stars.lens import StarCamera, calibrate_by_stars
 from kcal.stars.night import Attitude, NamedStars, SkyView, fit_attitude, name_stars
-from kcal.stars.sky import Air, StarCatalog, celestial_directions, identify, observed_directions
+from kcal.stars.sky import Air, StarCatalog, celestial_directions, identify, observed_directions, turn_between
 from scripts.check.chain_rig import ENU_FROM_RIG, Targets, landmarks, targets, true_rig
 from scripts.shared.long_range import ORIGIN, RANGES, matches_of
 from scripts.shared.night_scenes import PLACE, TIME, lens_trials, masts, scattered, star_images
@@ -143,12 +143,16 @@ def night(rig: TrueRig, cameras: tuple[Camera, Camera], case: Case, draw: np.ran
             index = up[inside]
             pixels = at.numpy()[inside] + draw.normal(0, STAR, (len(index), 2))
             # Of stars without names, the frame is that of the catalog.
-            turn = rotation[side] if case.named else rotation[side] @ _turn(seen[index], known[index])
+            turn = (
+                rotation[side]
+                if case.named
+                else rotation[side] @ torch.from_numpy(turn_between(known[index], seen[index]))
+            )
             moment[side] = NamedStars(
                 detected=DetectedStars(pixels, np.full(len(index), STAR), np.ones(len(index)), 0.02, {}),
                 view=view,
                 attitude=Attitude(
-                    rotation=turn, covariance=torch.zeros(3, 3).double(), star=index,
+                    rotation=rotation[side] @ torch.from_numpy(own), covariance=torch.zeros(3, 3).double(), star=index,
                     residual=np.zeros((len(index), 2)), rms_px=STAR, widened=1.0,
                 ),
                 directions=known,
@@ -158,12 +162,6 @@ def night(rig: TrueRig, cameras: tuple[Camera, Camera], case: Case, draw: np.ran
             )  # fmt: skip
         moments.append(moment)
     return star_source(moments, cameras, clock_sigma=CLOCK_SIGMA, origin=PLACE if case.named else None, catalog=bright)
-
-
-def _turn(seen: np.ndarray, known: np.ndarray) -> Tensor:
-    from kcal.stars.sky import turn_between
-
-    return torch.from_numpy(turn_between(known, seen))
 
 
 def data_of(made: Lenses, case: Case, seed: int) -> RigData:

@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from torch import Tensor
 from kcal import Camera, Localizer, Rig
 from kcal.locate.stereo import Localization, PositionStatus
 from kcal.locate.views import fit_views
-from scripts.shared.page import DOCS, Line, Lines, table
+from scripts.shared.page import DOCS, Line, Lines
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import section
 from scripts.shared.station_scenes import drawn_errors, marks, ring, targets
@@ -176,9 +176,9 @@ def peers(count: int = 20_000) -> Lines:
 
 @section("stations.md", "coverage", draws=200)
 @torch.no_grad()
-def coverage(draws: int = 20_000) -> Iterator[str]:
+def coverage(draws: int = 20_000) -> Lines:
     """Table of shares inside the 95 % ellipsoids."""
-    rows = []
+    yield ["distance", *(f"V = {views}" for views in range(2, 9))]
     for kilometers in (1, 5, 20):
         cells: list[object] = [f"{kilometers} km"]
         for views in range(2, 9):
@@ -195,8 +195,7 @@ def coverage(draws: int = 20_000) -> Iterator[str]:
             squares = (error * torch.linalg.solve(found.covariance[ok], error)).sum(-1)
             sigma = found.covariance[ok].diagonal(dim1=-2, dim2=-1)[:, :2].sum(-1).sqrt().median()
             cells.append(f"{(squares < _CHI2_95).double().mean():.1%} ({float(sigma):.2g} m)")
-        rows.append(cells)
-    return table(["distance", *(f"V = {views}" for views in range(2, 9))], rows)
+        yield cells
 
 
 def clipped(polygon: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:

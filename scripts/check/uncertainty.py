@@ -26,7 +26,6 @@ WEAK = 0.3
 # The middle, half way to a corner, and near two corners.
 PLACES = ((960.0, 540.0), (1440.0, 810.0), (100.0, 80.0), (1820.0, 100.0))
 ELLIPSE = -2.0 * math.log(0.05)  # the 95 % quantile of χ² with two degrees of freedom
-NORMAL = 1.959964**2  # with one
 MEDIAN = 0.674490  # of |x| of a normal variable
 # Of each model; mild enough to be regular all over the image.
 LENS = (-0.25, 0.08, 5e-4, -3e-4, -0.02, 0.03, -0.01, 0.003, 4e-4, -2e-4, -3e-4, 2e-4, 0.004, -0.003)

@@ -248,25 +248,22 @@ def judge_camera(planted: Planted) -> tuple[Verdict, float, float, Record]:
 
 def judge_pair(planted: PlantedPair) -> tuple[Verdict, float, float, Record]:
     """Verdict, true RMS error of ranges in meters, and over what is required."""
-    cameras = []
-    for seen in planted.alone:
-        cameras.append(calibrate_camera(seen, CalibrationOptions()).camera)
-    both = (cameras[0], cameras[1])
+    left, right = (calibrate_camera(seen, CalibrationOptions()).camera for seen in planted.alone)
+    both = left, right
     matched = pair_by_name(planted.pairs[0].names, planted.pairs[1].names)
     boards = paired_boards(both, planted.pairs, matched)
     result = solve_rig(RigData(cameras=both, names=("left", "right"), boards=boards))
     rig = result.stereo()
     need = Requirement.parse(RIG)[0]
     verdict = rig_verdict(rig, (need,), mark_sigma=MARK, result=result)
-    places: list[Tensor] = []
-    for u, v in itertools.product((-0.3, 0.0, 0.3), (-0.2, 0.0, 0.2)):
-        places.append(torch.tensor([0.5 + u, 0.5 + v]) * torch.tensor(planted.rig.left.size))
+    shares = itertools.product((-0.3, 0.0, 0.3), (-0.2, 0.0, 0.2))
+    places = [torch.tensor([0.5 + u, 0.5 + v]) * torch.tensor(planted.rig.left.size) for u, v in shares]
     rays = planted.rig.left.unproject(torch.stack(places).double())[0]
     pixels, seen_by_both = planted.rig(need.distance * rays)
-    (left, right), seen_by_both = pixels.unbind(-2), seen_by_both.all(-1)
+    marks, seen_by_both = pixels.unbind(-2), seen_by_both.all(-1)
     from kcal.locate.stereo import sight_lines
 
-    lines = sight_lines(rig, left, right)
+    lines = sight_lines(rig, *marks)
     off = (lines.points.norm(dim=-1) - need.distance)[seen_by_both]
     error = float(off.square().mean().sqrt())
     return verdict, error, error / need.meters, {}

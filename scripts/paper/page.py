@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from kcal.locate.budget import BudgetErrors, planned_rig, range_errors
 from scripts.paper.site import KINDS, MARK_SIGMA
@@ -314,13 +314,11 @@ def _figure_3(results: Results) -> Lines:
         ]
 
 
-def _marks(results: Results) -> Iterator[str]:
+def _marks(results: Results) -> Lines:
     shown = [("14", "integer"), ("14", "marked"), ("20", "marked"), ("hybrid", "marked")]
-    rows = []
+    yield ["", "14, whole pixels", *(f"{label}, marks to {MARK_SIGMA:g} px" for label, _ in shown[1:])]
     for name, runs in results.items():
-        rows.append([name, *(number(100 * _far_share(runs, label, kind), 1) for label, kind in shown)])
-    heads = ["14, whole pixels", *(f"{label}, marks to {MARK_SIGMA:g} px" for label, _ in shown[1:])]
-    return table(["", *heads], rows)
+        yield [name, *(number(100 * _far_share(runs, label, kind), 1) for label, kind in shown)]
 
 
 def _far_share(runs: list[dict], label: str, kind: str) -> float:

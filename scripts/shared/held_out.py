@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import cv2
@@ -20,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal import Observations
 from kcal.calibrate.hybrid.board_modes import board_modes
 
 BOARD_PRIOR, TWIST_PRIOR = 1e-3, 2e-3  # of the board's extent; radians, and distances of the board
@@ -172,6 +174,19 @@ def held_out(camera: Projection, points: Tensor, pixels: Tensor, weight: Tensor 
         sums.append(float((errors**2).sum()))
         without |= lost
     return HeldOut(sums[0], sums[1], int(problem.seen.sum()), int(without.sum()))
+
+
+def of_halves(cameras: Sequence[Projection], halves: Sequence[tuple[Observations, Tensor | None]]) -> dict[str, float]:
+    """RMS of each half's camera on the other half, both together, pixels; corners, and how many have no image."""
+    found = [
+        held_out(camera, seen.board.points, seen.pixels(), weight)
+        for camera, (seen, weight) in zip(cameras, halves[::-1], strict=True)
+    ]
+    corners, lost = sum(one.corners for one in found), sum(one.lost for one in found)
+    rms = {
+        key: math.sqrt(sum(getattr(one, key) for one in found) / max(1, corners - lost)) for key in ("still", "moved")
+    }
+    return {**rms, "lost": lost, "corners": corners}
 
 
 def _start(problem: _Problem) -> _State | None:

@@ -78,8 +78,6 @@ def rendered(
 
 
 SIZE, STAR = (1280, 800), 0.1  # px
-LENSES_FROM = ["boards", *(f"{what}, {where}" for where in ("level", "tilted 30°")
-                           for what in ("stars", "boards and stars"))]  # fmt: skip
 # Shares of the image that boards fill.
 FILL = (0.40, 0.94)
 
