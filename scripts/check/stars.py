@@ -143,11 +143,7 @@ def night(rig: TrueRig, cameras: tuple[Camera, Camera], case: Case, draw: np.ran
             index = up[inside]
             pixels = at.numpy()[inside] + draw.normal(0, STAR, (len(index), 2))
             # Of stars without names, the frame is that of the catalog.
-            turn = (
-                rotation[side]
-                if case.named
-                else rotation[side] @ torch.from_numpy(turn_between(known[index], seen[index]))
-            )
+            own = np.eye(3) if case.named else turn_between(known[index], seen[index])
             moment[side] = NamedStars(
                 detected=DetectedStars(pixels, np.full(len(index), STAR), np.ones(len(index)), 0.02, {}),
                 view=view,
