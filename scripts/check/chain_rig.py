@@ -81,10 +81,9 @@ def landmarks(rig: TrueRig, generator: torch.Generator) -> tuple[Landmarks, Land
     distance = NEAR * (FAR / NEAR) ** uniform(20 * LANDMARKS, 1)
     points = distance * rig.left.unproject(pixels)[0]
     pixels, valid = rig(points)
-    (left, right), valid = pixels.unbind(-2), valid.all(-1)
-    kept = (valid & ((right > EDGE) & (right < size - EDGE)).all(-1)).nonzero()[:LANDMARKS, 0]
-    points, marks = points[kept] @ ENU_FROM_RIG.T, torch.stack([left, right], 1)[kept]
-    exact = landmarks_of(points, marks, SURVEY, LANDMARK_MARK)
+    right = pixels[:, 1]
+    kept = (valid.all(-1) & ((right > EDGE) & (right < size - EDGE)).all(-1)).nonzero()[:LANDMARKS, 0]
+    exact = landmarks_of(points[kept] @ ENU_FROM_RIG.T, pixels[kept], SURVEY, LANDMARK_MARK)
     return with_noise(exact, generator), exact
 
 

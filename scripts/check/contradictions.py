@@ -42,10 +42,8 @@ def field(draw: torch.Generator, size: tuple[int, int]) -> Callable[[Tensor], Te
 
 def radial(draw: torch.Generator, size: tuple[int, int]) -> Callable[[Tensor], Tensor]:
     """The same, as r³ changes it, in or out."""
-    middle, sign = (
-        torch.tensor(size, dtype=torch.float64) / 2.0,
-        1.0 - 2.0 * float(torch.rand((), generator=draw) < 0.5),
-    )
+    middle = torch.tensor(size, dtype=torch.float64) / 2.0
+    sign = 1.0 - 2.0 * float(torch.rand((), generator=draw) < 0.5)
     sides = [torch.linspace(-float(side), float(side), 25, dtype=torch.float64) for side in middle]
     cubic = torch.cartesian_prod(*sides)
     scale = sign * FIELD / float((cubic * cubic.square().sum(-1, keepdim=True)).square().mean().sqrt())

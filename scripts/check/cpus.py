@@ -42,6 +42,7 @@ from kcal.lens.uncertainty import projection_sigma
 from kcal.rig import RigCovariance, pair_by_name
 from kcal.solve import SolverStatus
 from scripts.check import rig as site
+from scripts.shared.children import ALONE
 from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.real_captures import stereo_images
 from scripts.shared.sections import section
@@ -240,8 +241,8 @@ SETTINGS: dict[str, dict[str, str]] = {
 def environment(setting: str) -> dict[str, str]:
     """That of a process which computes as the setting says; variables of another setting are removed."""
     ours = {name for setting in SETTINGS.values() for name in setting}
-    one_thread = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    return {k: v for k, v in os.environ.items() if k not in ours} | one_thread | SETTINGS[setting]
+    kept = {k: v for k, v in os.environ.items() if k not in ours}
+    return kept | ALONE | {"PYTHONPATH": str(ROOT)} | SETTINGS[setting]
 
 
 def outcomes(report: Path) -> dict[str, str]:

@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 import psutil
 
+from scripts.shared.children import ALONE
 from scripts.shared.memory import peak_megabytes
 from scripts.shared.page import Lines
 from scripts.shared.sections import section
@@ -70,7 +71,7 @@ class Cluster:
     def _start(self, kind: str, *options: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", *options, "--host", "127.0.0.1",
                    "--no-dashboard", "--scheduler-file", str(self._where)]  # fmt: skip
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=_environment())
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | ALONE)
 
     @property
     def address(self) -> str:
@@ -114,10 +115,6 @@ def _works(process: psutil.Process) -> bool:
     return False
 
 
-def _environment() -> dict[str, str]:
-    return os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-
-
 @contextlib.contextmanager
 def cluster(folder: Path, workers: int) -> Iterator[Cluster]:
     started = Cluster(folder, workers)
@@ -138,7 +135,7 @@ def batch(
     before, peaks, kills = children_seconds(), defaultdict[str, float](float), 0
     next_kill = pieces_kept(output) + every
     with tempfile.TemporaryFile("w+") as said:
-        running = subprocess.Popen(command, stdout=said, stderr=said, env=_environment())
+        running = subprocess.Popen(command, stdout=said, stderr=said, env=os.environ | ALONE)
         while running.poll() is None:
             time.sleep(0.2)
             _note_peaks(peaks, running.pid, on)

@@ -356,11 +356,10 @@ def landmarks(draw: torch.Generator) -> Landmarks:
     ray = torch.stack([1.0 * (share[:, 1] - 0.5), 0.4 * (share[:, 2] - 0.5), torch.ones_like(share[:, 0])], -1)
     points = distance * ray / ray.norm(dim=-1, keepdim=True)
     pixels, valid = RIG(points)
-    (left, right), valid = pixels.unbind(-2), valid.all(-1)
-    seen = (valid & RIG.left.inside(left) & RIG.right.inside(right)).nonzero()[:count, 0]
-    pixels = torch.stack([left, right], 1)[seen]
+    left, right = pixels.unbind(-2)
+    seen = (valid.all(-1) & RIG.left.inside(left) & RIG.right.inside(right)).nonzero()[:count, 0]
     enu = points[seen] @ torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]], dtype=torch.float64)
-    return with_noise(landmarks_of(enu, pixels, 0.02, MARK), draw)
+    return with_noise(landmarks_of(enu, pixels[seen], 0.02, MARK), draw)
 
 
 def at_five_km(found: RigResult, draw: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -418,9 +417,8 @@ def speed(counts: tuple[int, ...] = (2000, 20_000)) -> Iterator[str]:
     for count in counts:
         draw = torch.Generator().manual_seed(1)
         share = torch.rand(6 * count, 3, dtype=torch.float64, generator=draw)
-        points = (
-            50.0 * 400.0 ** share[:, :1] * RIG.left.unproject(share[:, 1:] * (torch.tensor(RIG.left.size) - 1.0))[0]
-        )
+        rays, _ = RIG.left.unproject(share[:, 1:] * (torch.tensor(RIG.left.size) - 1.0))
+        points = 50.0 * 400.0 ** share[:, :1] * rays
         pixels, valid = RIG(points)
         (left, right), valid = pixels.unbind(-2), valid.all(-1)
         seen = (valid & RIG.left.inside(left) & RIG.right.inside(right)).nonzero()[:count, 0]

@@ -245,9 +245,8 @@ def smoke(draws: int = 2000) -> Lines:
         ok = found.status == OK
         spread = found.covariance[:, :2, :2]
         error = (found.enu - points)[:, :2]
-        inside = (error * torch.linalg.solve(torch.where(ok[:, None, None], spread, torch.eye(2)), error)).sum(
-            -1
-        ) < 5.991
+        known = torch.where(ok[:, None, None], spread, torch.eye(2))
+        inside = (error * torch.linalg.solve(known, error)).sum(-1) < 5.991
         areas = math.pi * 5.991 * torch.linalg.det(spread[ok]).sqrt()
         hit, crossed = [], []
         for i in range(draws):

@@ -106,10 +106,8 @@ def drawn(kind: str, seed: int) -> tuple[Rig, Landmarks, Record]:
     scale = baseline / float(TRUTH.baseline)
     truth = Rig.pair(TRUTH.left, TRUTH.right, TRUTH.right_from_left_rotation, scale * TRUTH.right_from_left_translation)
     pixels, seen = truth(points)
-    (left, right), seen = pixels.unbind(-2), seen.all(-1)
-    seen &= points[:, 2] > 30.0
-    kept = seen.nonzero()[:count, 0]
-    exact = landmarks_of(points[kept] @ LOOK, torch.stack([left, right], 1)[kept], survey, mark)
+    kept = (seen.all(-1) & (points[:, 2] > 30.0)).nonzero()[:count, 0]
+    exact = landmarks_of(points[kept] @ LOOK, pixels[kept], survey, mark)
     head = {"kind": kind, "seed": seed, "baseline": baseline, "count": len(kept), "distance": distance}
     return truth, exact, head
 

@@ -132,17 +132,13 @@ def split(results: Results) -> list[str]:
     rows, limits = [], []
     for name, runs in results.items():
         for label in (*SHOWN, MIXED):
-            parts: list[list[float]] = [
-                [lens_share(run, label) for run in runs],
-                [rig_share(run, label) for run in runs],
-                [calibration(run, label) for run in runs],
-                [run["bound"][-1] for run in runs],
-                [everywhere(run, label) for run in runs],
-            ]
-            lens, rig, both, marks, far = parts
-            over = number(median(over_bound(run, label) for run in runs), 2)
-            cells = [number(median(lens), 0), number(median(rig), 0), middle(both, 0), number(median(marks), 0)]
-            rows.append([name, label, *cells, over, middle(far, 0)])
+            lens, rig, both, far, over = (
+                [value(run, label) for run in runs]
+                for value in (lens_share, rig_share, calibration, everywhere, over_bound)
+            )
+            cells = [number(median(lens), 0), number(median(rig), 0), middle(both, 0)]
+            cells += [number(median(run["bound"][-1] for run in runs), 0), number(median(over), 2), middle(far, 0)]
+            rows.append([name, label, *cells])
         limits += ["", _limits(name, runs)]
     heads = ["camera", "model", "lenses", "rig", "calibration", "marks", "total / marks", "all over the image"]
     return [*table(heads, rows), *limits]
@@ -271,9 +267,7 @@ def choice(results: Results) -> list[Line]:
             "views": [lowest({m: run["held_out"][m] for m in models}) for run in runs],
             "checks": [lowest({m: rms(run["located"][m]["check_reprojection"]) for m in models}) for run in runs],
             "leak": [lowest({m: relative(run, m) for m in models}) for run in runs],
-            "hybrid": ["hybrid"] * len(runs),
-            "20": ["20"] * len(runs),
-            "14": ["14"] * len(runs),
+            **{label: [label] * len(runs) for label in ("hybrid", "20", "14")},
         }
         scores = {
             how: [100 * relative(run, label) if label else math.nan for run, label in zip(runs, which, strict=True)]

@@ -212,6 +212,5 @@ def background(rig: Rig, side: int, random: np.random.Generator, amplitude: floa
         wave = np.sin(frequency * (azimuth * math.cos(turn) + elevation * math.sin(turn)) + phase)
         light += amplitude * wave * (elevation < 0.06)
     coarse = torch.from_numpy(light.reshape(1, 1, height // 4 + 2, width // 4 + 2))
-    return torch.nn.functional.interpolate(coarse, size=(height, width), mode="bicubic", align_corners=True)[
-        0, 0
-    ].numpy()
+    fine = torch.nn.functional.interpolate(coarse, size=(height, width), mode="bicubic", align_corners=True)
+    return fine[0, 0].numpy()
