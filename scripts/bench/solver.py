@@ -158,7 +158,7 @@ def with_ceres(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...
     return shared[:4], shared[4:], rotation, np.array(poses)[:, 3:], seconds
 
 
-SOLVERS = {
+SOLVERS: dict[str, Any] = {
     "kcal": with_kcal,
     "kcal, weak prior": functools.partial(with_kcal, weak=WEAK),
     "OpenCV": with_opencv,
