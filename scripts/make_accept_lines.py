@@ -92,6 +92,8 @@ equidistant | 1637.7580409572782 800 | 1.7320508075688772 0 -1 | 1e-9 | 120 degr
 prism | 600.1 399.8 | 0.1 0 1 | 1e-9 | 0.1 + 0.01 x 0.01, 0 - 0.02 x 0.01
 """
 PEERS = ("euroc-cam0", "kitti-0926-cam0", "tumvi-cam0", "rational", "thin-prism", "tilted")
+# Of OpenCV's coefficients.
+ORDER = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y"]
 MRCAL = {"opencv4": "OPENCV4", "opencv5": "OPENCV5", "opencv8": "OPENCV8", "opencv12": "OPENCV12"}
 # Places over the image, in half widths and half heights from the middle.
 GRID = [(a, b) for a in (-0.93, -0.47, 0.04, 0.51, 0.9) for b in (-0.88, -0.43, 0.07, 0.49, 0.92)]
@@ -123,8 +125,7 @@ def by_opencv() -> Iterator[str]:
             pixels, _ = cv2.fisheye.projectPoints(rays(name)[:, None], none, none, matrix, values)
             source = f"OpenCV {cv2.__version__}, fisheye.projectPoints"
         else:
-            order = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y"]
-            values = np.array([named.get(key, 0.0) for key in order])
+            values = np.array([named.get(key, 0.0) for key in ORDER])
             pixels, _ = cv2.projectPoints(rays(name), none, none, matrix, values)
             source = f"OpenCV {cv2.__version__}, projectPoints"
         for pixel, ray in zip(pixels[:, 0], rays(name), strict=True):
@@ -137,9 +138,8 @@ def by_mrcal(python: str) -> Iterator[str]:
         model, _, (fx, fy, cx, cy), named = CAMERAS[name]
         if model not in MRCAL:
             continue
-        order = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"][: int(model[6:])]
         data = {"model": f"LENSMODEL_{MRCAL[model]}", "rays": rays(name).tolist(),
-                "values": [fx, fy, cx, cy, *(named.get(key, 0.0) for key in order)]}  # fmt: skip
+                "values": [fx, fy, cx, cy, *(named.get(key, 0.0) for key in ORDER[: int(model[6:])])]}  # fmt: skip
         code = (
             "import json, sys, numpy, mrcal; d = json.load(sys.stdin); "
             "p = mrcal.project(numpy.array(d['rays']), d['model'], numpy.array(d['values'])); "

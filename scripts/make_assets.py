@@ -16,11 +16,7 @@ from pathlib import Path
 
 ASSETS = Path(__file__).resolve().parent.parent / "assets"
 BOARDS = (("9x6", "25mm", "A4"), ("7x6", "50mm", "A2"))
-FROM_DEMO = {
-    "map.png": "demo-map.png",
-    "rig.json": "sample-rig.json",
-    "points.csv": "sample-points.csv",
-}
+FROM_DEMO = {"map.png": "demo-map.png", "rig.json": "sample-rig.json", "points.csv": "sample-points.csv"}
 
 
 def kcal(*arguments: str) -> None:

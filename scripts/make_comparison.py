@@ -26,7 +26,7 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
-from kcal import Board, Landmarks, Observations, View, calibrate_camera
+from kcal import Board, Observations, calibrate_camera
 from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save_picture
 from kcal.sim.captures import PrintedBoard, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
@@ -36,8 +36,10 @@ from scripts.make_assets import ASSETS
 from scripts.paper.locate import SIDES
 from scripts.paper.locate import by_opencv as opencv_rig
 from scripts.shared.captures import capture_corners
+from scripts.shared.long_range import landmarks_of
 from scripts.shared.peer_lenses import calibrated
 from scripts.shared.timing import show
+from scripts.shared.traced import as_observations
 
 RANGES, BEARINGS = (1000.0, 5000.0), (-32.0, -24.0, -16.0, -8.0, 0.0, 8.0, 16.0, 24.0, 32.0)
 NOISE, VIEWS = 0.05, 20
@@ -63,14 +65,7 @@ def corners(scene: DemoScene, draw: int, side: int) -> Observations:
     board = scene.near_board
     lens = (scene.rig.left, scene.rig.right)[side]
     seen = capture_corners(lens, VIEWS, sigma=NOISE, seed=2 * draw + side, board=board, fill=(0.4, 0.9))
-    views = [
-        View(name=f"{i:02d}", pixels=tuple((float(u), float(v)) for u, v in view)) for i, view in enumerate(seen.pixels)
-    ]
-    return Observations(
-        board=Board(columns=board.columns, rows=board.rows, square=board.square),
-        image_size=lens.size,
-        views=tuple(views),
-    )
+    return as_observations(seen.pixels, lens.size, Board(columns=board.columns, rows=board.rows, square=board.square))
 
 
 def measured(draw: int) -> dict[str, Any]:
@@ -90,13 +85,8 @@ def measured(draw: int) -> dict[str, Any]:
 def by_kcal(scene: DemoScene, seen: tuple[Observations, Observations], survey: NamedPoints) -> Tensor:
     """Positions (N, 3) of the targets by kcal's calibration, rig and localizer."""
     marks = scene.landmark_marks
-    landmarks = Landmarks(
-        names=survey.names,
-        points=survey.enu,
-        sigma=torch.full_like(survey.enu, scene.survey_sigma),
-        pixels=torch.stack([marks.left, marks.right], 1),
-        pixel_sigma=scene.mark_sigma,
-    )
+    pixels = torch.stack([marks.left, marks.right], 1)
+    landmarks = landmarks_of(survey.enu, pixels, scene.survey_sigma, scene.mark_sigma)
     with torch.no_grad():
         cameras = calibrate_camera(seen[0]).camera, calibrate_camera(seen[1]).camera
         found = localizer(cameras, landmarks, "prior")(scene.target_marks.true_left, scene.target_marks.true_right)
@@ -116,11 +106,7 @@ def turned(scene: DemoScene, enu: Tensor) -> Tensor:
     angle = math.radians(scene.heading_deg)
     east, north = enu[:, 0], enu[:, 1]
     return torch.stack(
-        [
-            east * math.cos(angle) - north * math.sin(angle),
-            east * math.sin(angle) + north * math.cos(angle),
-        ],
-        -1,
+        [east * math.cos(angle) - north * math.sin(angle), east * math.sin(angle) + north * math.cos(angle)], -1
     )
 
 

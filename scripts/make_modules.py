@@ -37,6 +37,7 @@ from kcal.nets import InverseNet, ResidualNet
 from kcal.rig import mounting_covariance
 from kcal.solve import LevenbergMarquardt
 from kcal.track import ObjectDisparity, PairBoxes
+from scripts.shared.page import table
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "modules.md"
 # What only others are made of.
@@ -109,10 +110,7 @@ PLACES = torch.tensor([[4.0, -8.0, 160.0], [-30.0, 14.0, 120.0], [2.0, 2.0, 40.0
 def pairs() -> Values:
     """Marked pixels of three points in both images."""
     left, right = rig()(PLACES)[0].unbind(-2)
-    return {
-        "pixels": left.detach() + 0.1 * noise(3, 2),
-        "other": right.detach() + 0.1 * noise(3, 2, seed=1),
-    }
+    return {"pixels": left.detach() + 0.1 * noise(3, 2), "other": right.detach() + 0.1 * noise(3, 2, seed=1)}
 
 
 def pair_cov() -> Tensor:
@@ -523,30 +521,27 @@ def moves(case: Case) -> bool:
     return all(part.is_meta for part in [*moved.parameters(), *moved.buffers()])
 
 
-def compiles(case: Case) -> bool:
-    """Whether it is one graph without breaks, with the same results."""
-    torch.compiler.reset()
+def agrees(case: Case, made: Callable[[nn.Module, dict[str, Any]], Any]) -> bool:
+    """Whether what is made of a module gives the results of the module itself."""
     module, inputs = case.make(0), case.inputs()
     if isinstance(module, Cylinder | LevenbergMarquardt):
         return False
     wanted = results(module, inputs)
     try:
-        compiled = torch.compile(module, backend="eager", fullgraph=True)
-        return close(wanted, results(compiled, inputs), 1e-5)  # type: ignore
+        return close(wanted, results(made(module, inputs), inputs), 1e-5)
     except Exception:  # of many kinds; none of them is a wrong number
         return False
 
 
+def compiles(case: Case) -> bool:
+    """Whether it is one graph without breaks, with the same results."""
+    torch.compiler.reset()
+    return agrees(case, lambda module, _: torch.compile(module, backend="eager", fullgraph=True))
+
+
 def exports(case: Case) -> bool:
     """Whether `torch.export` makes a program of it, with the same results."""
-    module, inputs = case.make(0), case.inputs()
-    if isinstance(module, Cylinder | LevenbergMarquardt):
-        return False
-    try:
-        program = torch.export.export(module, (), inputs).module()
-        return close(results(module, inputs), results(program, inputs), 1e-5)
-    except Exception:  # likewise
-        return False
+    return agrees(case, lambda module, inputs: torch.export.export(module, (), inputs).module())
 
 
 def loaded(case: Case) -> bool:
@@ -597,9 +592,9 @@ def table_rows(text: str) -> dict[str, dict[str, str]]:
 def page(rows: list[dict[str, str]]) -> str:
     """The whole page."""
     head = list(rows[0])
-    lines = [head, ["---"] * len(head), *([one[column] for column in head] for one in rows)]
+    lines = table(head, ([one[column] for column in head] for one in rows))
     before = PAGE.read_text(encoding="utf-8").split("\n|", 1)[0] if PAGE.exists() else "# Modules\n"
-    return before.rstrip() + "\n\n" + "\n".join(f"| {' | '.join(cells)} |" for cells in lines) + "\n"
+    return before.rstrip() + "\n\n" + "\n".join(lines) + "\n"
 
 
 def main() -> None:

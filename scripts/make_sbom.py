@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -52,21 +53,23 @@ def requirements() -> list[Requirement]:
     return [Requirement(text) for text in project["dependencies"]]
 
 
-def needed() -> dict[str, list[str]]:
-    """Each package that is installed with kcal, and the packages that it needs itself."""
+def needed(wanted: Iterable[Requirement], extra: str = "") -> dict[str, list[str]]:
+    """Each package that is installed for some requirements, and the packages that it needs itself."""
     out: dict[str, list[str]] = {}
-    rest = [canonicalize_name(each.name) for each in requirements()]
-    while rest:
-        name = rest.pop()
-        if name in out:
+    waiting = [(each, extra) for each in wanted]
+    while waiting:
+        requirement, given = waiting.pop()
+        name = canonicalize_name(requirement.name)
+        if name in out or (requirement.marker and not requirement.marker.evaluate({"extra": given})):
             continue
-        found = []
-        for text in importlib.metadata.requires(name) or []:
-            each = Requirement(text)
-            if each.marker is None or each.marker.evaluate({"extra": ""}):
-                found.append(canonicalize_name(each.name))
-        out[name] = sorted(set(found))
-        rest += found
+        found = [
+            (each, one)
+            for each in map(Requirement, importlib.metadata.requires(name) or ())
+            for one in requirement.extras or {""}
+            if each.marker is None or each.marker.evaluate({"extra": one})
+        ]
+        out[name] = sorted({canonicalize_name(each.name) for each, _ in found})
+        waiting += found
     return dict(sorted(out.items()))
 
 
@@ -89,7 +92,7 @@ def version_of(name: str) -> str:
 
 def content() -> dict[str, Any]:
     """The document."""
-    packages = needed()
+    packages = needed(requirements())
     refs = {name: f"pkg:pypi/{name}@{version_of(name)}" for name in packages}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     own = f"pkg:pypi/kcal@{project['version']}"

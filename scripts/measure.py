@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from scripts.shared.children import ASKED, answer
-from scripts.shared.page import DOCS, read_section, write_section
+from scripts.shared.page import DOCS, laid_out, read_section, write_section
 from scripts.shared.sections import SECTIONS, Kept, Section, seeds
 from scripts.shared.timing import children_seconds, show
 
@@ -86,7 +86,7 @@ def make(each: Section, given: dict[str, Any], *, quick: bool, write: bool) -> N
     more = {"write": write} if "write" in each.options else {}
     try:
         lines = []
-        for line in each.make(**((each.quick if quick else {}) | chosen | more)) or ():
+        for line in laid_out(each.make(**((each.quick if quick else {}) | chosen | more)) or ()):
             lines += show([line])
     except (ImportError, SystemExit) as missing:
         if isinstance(missing, SystemExit) and not isinstance(missing.code, str):
@@ -141,7 +141,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Read the command line: the page comes first, then its sections."""
     words = sys.argv[1:] if arguments is None else arguments
     known = sorted(path.stem for path in DOCS.glob("*.md"))
-    page = words[0] if words and not words[0].startswith("-") else ""
+    page = next((word for word in words if not word.startswith("-")), "")
     if page and page not in known:
         raise SystemExit(f"{page!r} is no page; there are {', '.join(known)}")
     own = [each for one in ([page] if page else known) for each in load(one)]

@@ -12,7 +12,7 @@ from calibrate_scenes import camera, motions, observe, pixels_of
 from kcal import CalibrationOptions, Camera, Observations
 from scripts.measure import make
 from scripts.paper import chain, figures, locate, reproduce, solve, train_eq12, train_net_lens
-from scripts.paper.numbers import TABLE_3
+from scripts.paper.page import TABLE_3
 from scripts.shared import page
 from scripts.shared.sections import SECTIONS, Kept
 

@@ -11,7 +11,7 @@ import torch
 from kcal.lens.camera import Camera
 from scripts.check import aspect, captures_that_move, ordinary
 from scripts.shared.held_out import held_out
-from scripts.shared.mrcal_camera import SplinedCamera
+from scripts.shared.peer_lenses import SplinedCamera
 from scripts.shared.sections import Kept, seeds
 from scripts.shared.simulated import BOARD, stretched
 

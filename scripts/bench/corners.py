@@ -28,7 +28,7 @@ from kcal.lens import rotation_from_vector
 from kcal.sim.captures import BoardSize, project_board
 from kcal.sim.scene import RenderOptions, render_light
 from scripts.bench.found import by_sector
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 from scripts.shared.real_captures import stereo_images
 from scripts.shared.sections import section
 
@@ -167,20 +167,19 @@ def summary(cells: dict[tuple[int, float, int], dict[str, Errors]]) -> str:
 
 
 @section("corners.md", "refinement", squares=(40,), boards=1)
-def refinement(squares: tuple[int, ...] = SQUARES, boards: int = 20) -> Iterator[str]:
+def refinement(squares: tuple[int, ...] = SQUARES, boards: int = 20) -> Lines:
     """RMS per axis of every method at the usual noise, then the predicted over the true standard deviation of erf."""
     places = itertools.product(squares, BLURS, NOISES)
     cells = {place: run_cell(*place, boards) for place in places}
     names = list(next(iter(cells.values())))
-    rows = []
+    yield ["square", "blur", *names, "predicted/true σ"]
     for (square, blur, noise), cell in cells.items():
         if noise == SHOWN:
             shown = [errors.row() for errors in cell.values()]
             lost = [f" ({100 * row[3]:.1f} %)" if 5e-4 < row[3] < 1 else "" for row in shown]
             rms = [f"{row[0]:.4f}{more}".replace("nan", "lost") for row, more in zip(shown, lost, strict=True)]
-            rows.append([square, f"{blur:g}", *rms, f"{cell['kcal erf'].row()[4]:.2f}"])
-    yield from table(["square", "blur", *names, "predicted/true σ"], rows)
-    yield from ["", summary(cells)]
+            yield [square, f"{blur:g}", *rms, f"{cell['kcal erf'].row()[4]:.2f}"]
+    yield summary(cells)
 
 
 @section("corners.md", "real", refinements=("saddle",))

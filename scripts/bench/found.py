@@ -40,13 +40,6 @@ _SECTOR = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALI
 Detector = Callable[[NDArray[Any], Board], Tensor | None]
 
 
-def classic(image: NDArray[Any], board: Board) -> Tensor | None:
-    """`findChessboardCorners` and `cornerSubPix`."""
-    gray = to_8bit(image)
-    corners = by_classic(gray, board)
-    return None if corners is None else as_points(gray, corners, board)
-
-
 def by_classic(gray: NDArray[np.uint8], board: Board, refine: bool = True) -> NDArray[Any] | None:
     """OpenCV's own answer."""
     found, corners = cv2.findChessboardCorners(gray, (board.columns, board.rows), flags=_CLASSIC)
@@ -61,22 +54,22 @@ def by_sector(gray: NDArray[np.uint8], board: Board) -> NDArray[Any] | None:
     return corners if found else None
 
 
-def as_points(gray: NDArray[np.uint8], corners: NDArray[Any], board: Board) -> Tensor:
+def by_opencv(find: Callable[[NDArray[np.uint8], Board], NDArray[Any] | None]) -> Detector:
     """OpenCV's corners in the board's order."""
-    return canonical_order(gray, torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)), board)
 
+    def detect(image: NDArray[Any], board: Board) -> Tensor | None:
+        gray = to_8bit(image)
+        if (corners := find(gray, board)) is None:
+            return None
+        return canonical_order(gray, torch.from_numpy(corners.reshape(-1, 2).astype(np.float64)), board)
 
-def sector(image: NDArray[Any], board: Board) -> Tensor | None:
-    """`findChessboardCornersSB`."""
-    gray = to_8bit(image)
-    corners = by_sector(gray, board)
-    return None if corners is None else as_points(gray, corners, board)
+    return detect
 
 
 DETECTORS: dict[str, Detector] = {
     "kcal": lambda image, board: detect_board(image, board).pixels,
-    "classic, cornerSubPix 5": classic,
-    "SB, exhaustive, accurate, normalized": sector,
+    "classic, cornerSubPix 5": by_opencv(by_classic),
+    "SB, exhaustive, accurate, normalized": by_opencv(by_sector),
 }
 
 

@@ -26,9 +26,8 @@ from kcal.errors import KcalError
 from scripts.bench import solver
 from scripts.shared.children import ALONE, answer, interpreter, or_failure
 from scripts.shared.memory import peak_megabytes
-from scripts.shared.mrcal_spline import splined
-from scripts.shared.page import table
-from scripts.shared.peer_lenses import calibrated
+from scripts.shared.page import Lines, table
+from scripts.shared.peer_lenses import calibrated, splined
 from scripts.shared.real_captures import load, names
 from scripts.shared.sections import section
 from scripts.shared.timing import children_seconds
@@ -125,9 +124,10 @@ def time_of_fits(
 
 
 @section("one-camera.md", "captures", captures=("ch1280",))
-def time_of_captures(captures: tuple[str, ...] = ("all",), timeout: float = 300.0) -> Iterator[str]:
+def time_of_captures(captures: tuple[str, ...] = ("all",), timeout: float = 300.0) -> Lines:
     """Captures by strangers; in brackets the default camera's time over the other's."""
-    mrcal, rows = interpreter("mrcal"), list[list[Any]]()
+    mrcal = interpreter("mrcal")
+    yield ["capture", "views", "corners", DEFAULT, TYPED, OPENCV, *[f"mrcal, {FEWER}"] * bool(mrcal)]
     ratios, sums = dict[str, list[float]](), [0.0, 0.0]
     for name in names() if captures == ("all",) else captures:
         seen = load(name).seen
@@ -142,18 +142,16 @@ def time_of_captures(captures: tuple[str, ...] = ("all",), timeout: float = 300.
             if "failed" not in spent:
                 ratios.setdefault(other, []).append(first / spent["seconds"])
             cells.append(spent.get("failed") or f"{spent['seconds']:.3f} s ({ratios[other][-1]:.0f})")
-        rows.append([name, len(seen.views), int(seen.pixels().isfinite().all(-1).sum()), *cells])
+        yield [name, len(seen.views), int(seen.pixels().isfinite().all(-1).sum()), *cells]
     middle = [f"median {statistics.median(ratios[each]):.0f}" for each in ratios]
-    rows.append(["all", "", "", f"{sums[0]:.1f} s", f"{sums[1]:.1f} s", *middle])
-    heads = ["capture", "views", "corners", DEFAULT, TYPED, OPENCV, *[f"mrcal, {FEWER}"] * bool(mrcal)]
-    yield from table(heads, rows)
+    yield ["all", "", "", f"{sums[0]:.1f} s", f"{sums[1]:.1f} s", *middle]
 
 
 @section("one-camera.md", "many", cameras=2, each=6)
-def many(cameras: int = 64, each: int = 30) -> Iterator[str]:
+def many(cameras: int = 64, each: int = 30) -> Lines:
     """Many cameras in one call, and in calls of their own."""
     yield f"{cameras} cameras of {each} views each. One call also finds which of them saw one board."
-    yield ""
-    found = ((way, own(way, each, cameras)) for way in (MANY, SINGLE))
-    rows = ([way, f"{one['seconds']:.1f} s", f"{one['megabytes'] - one['before']:.0f} MB"] for way, one in found)
-    yield from table(["way", "processor time", "memory, more than before"], rows)
+    yield ["way", "processor time", "memory, more than before"]
+    for way in (MANY, SINGLE):
+        one = own(way, each, cameras)
+        yield [way, f"{one['seconds']:.1f} s", f"{one['megabytes'] - one['before']:.0f} MB"]

@@ -14,6 +14,7 @@ from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.calibrate.problem.board_problem import BoardProblem
 from scripts.shared.page import table
 from scripts.shared.sections import section
+from scripts.shared.timing import times
 from scripts.shared.views import MODELS, SIZE, simulate
 
 VIEWS, REPEATS, STEP = (30, 200, 800), 3, 1e-3
@@ -26,12 +27,7 @@ MOST_DEFAULT = 200  # views
 
 def timed(call: Callable[[], object]) -> float:
     """Median of the CPU seconds of some calls."""
-    seconds = []
-    for _ in range(REPEATS):
-        start = time.process_time()
-        call()
-        seconds.append(time.process_time() - start)
-    return statistics.median(seconds)
+    return statistics.median(times([call], REPEATS, time.process_time)[0])
 
 
 def linear_gradient(found: CalibratedViews, pixels: Tensor, board: Tensor, options: CalibrationOptions) -> Tensor:

@@ -10,7 +10,6 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ from kcal import Localizer, Origin, Rig, save_rig
 from kcal.pipeline.pairing import ObjectViews
 from kcal.rig import Mounting, RigCovariance, planned_rig
 from kcal.track import Tracker
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 
 
@@ -77,7 +76,7 @@ def share_of_core(costs: list[float]) -> str:
 @section("tracks.md", "live", hours=0.003, kills=1, runs=1, eager=True)
 def live(
     hours: float = 1.0, rate: float = 2.0, targets: int = 5, kills: int = 10, runs: int = 5, eager: bool = False
-) -> Iterator[str]:
+) -> Lines:
     costs = []
     for compiled in (False, not eager):
         cost_of_tracks(moments=12, compiled=compiled)
@@ -127,8 +126,8 @@ def live(
     early, late = max(memory[: 2 * quarter]), max(memory[-quarter:])
 
     yield f"{hours:g} h of {rate:g} moments a second with {targets} targets, replayed as fast as it goes."
-    yield ""
     rows: list[list[object]] = [
+        ["", "found"],
         ["moments, positions", f"{moments:,}, {sum(seen.values()):,}"],
         ["malformed lines among them", malformed],
         ["kills (SIGKILL)", killed],
@@ -138,4 +137,4 @@ def live(
         ["50 tracks, one moment", share_of_core(costs[0])],
         ["the same, compiled", share_of_core(costs[1])],
     ]
-    yield from table(["", "found"], rows)
+    yield from rows

@@ -2,12 +2,19 @@
 
 Within a round every side runs once, in turn; ratios are taken within a round: medians, below 1 kcal is
 faster. The statistics are simulations with fixed seeds and do not depend on the machine.
+
+*tables*: `kcal locate` on long tables, rows per second of processor time (user and system, so that other work on the
+machine counts less) and peak memory, for each format. Each run is a process of its own with one thread, which locates a
+table of one row first; of several runs the fastest counts.
 """
 
 from __future__ import annotations
 
 import math
+import sys
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,6 +23,7 @@ import torch
 from kornia.geometry.epipolar import triangulate_points
 from torch import Tensor
 
+from kcal import save_rig
 from kcal.lens.pair_errors import RigCovariance
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
@@ -24,8 +32,10 @@ from kcal.locate.angular import triangulate_linear, triangulate_pairs
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.localizer import Localizer
 from kcal.locate.tabulate import circular_error
+from kcal.rig import Mounting, mounting_covariance
+from scripts.shared.children import answer
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 from scripts.shared.sections import section
 from scripts.shared.timing import median, ratio, times
 
@@ -58,13 +68,16 @@ def sides(points: Tensor, sigma: float) -> Tensor:
 
 @section("locate.md", "triangulation", rounds=1, points=COUNTS[:1])
 @torch.no_grad()
-def triangulation(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[str]:
+def triangulation(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Lines:
     cameras = poses()
     pose = cameras[1, :, :3].contiguous(), cameras[1, :, 3].contiguous()
     P = cameras.numpy()
     torch.compiler.reset()
     compiled = torch.compile(triangulate_pairs, fullgraph=True, dynamic=True)
-    rows = []
+    yield [
+        "points", "kcal closed form", "kcal compiled", "OpenCV", "kornia eigh", "kornia cofactor", "closed / OpenCV",
+        "closed / cofactor",
+    ]  # fmt: skip
     for count in points:
         flat = sides(some_points(count), 0.1)
         rays = torch.cat([flat, torch.ones(count, 2, 1, dtype=torch.float64)], -1)
@@ -80,18 +93,16 @@ def triangulation(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterato
         ]
         found = times(calls, rounds)
         rate = [median([1e-6 * count / s for s in side], 2) for side in found]
-        rows.append([f"{count:.0e}", *rate, ratio(found[0], found[2]), ratio(found[0], found[4])])
-    heads = ["points", "kcal closed form", "kcal compiled", "OpenCV", "kornia eigh", "kornia cofactor"]
-    return table([*heads, "closed / OpenCV", "closed / cofactor"], rows)
+        yield [f"{count:.0e}", *rate, ratio(found[0], found[2]), ratio(found[0], found[4])]
 
 
 @section("locate.md", "accuracy")
 @torch.no_grad()
-def accuracy(count: int = 100_000) -> Iterator[str]:
+def accuracy(count: int = 100_000) -> Lines:
     cameras = poses()
     P = cameras.numpy()
     point = torch.tensor([[300.0, -100.0, 5000.0]], dtype=torch.float64).expand(count, 3)
-    rows = []
+    yield ["at 5 km", "kcal closed form", "kcal singular values", "OpenCV", "kornia eigh", "kornia cofactor"]
     for name, sigma in (("0.1 px of noise: RMS error, m", 0.1), ("no noise: largest error, m", 0.0)):
         flat = sides(point, sigma)
         rays = torch.cat([flat, torch.ones(count, 2, 1, dtype=torch.float64)], -1)
@@ -106,10 +117,8 @@ def accuracy(count: int = 100_000) -> Iterator[str]:
         ]
         errors = [torch.linalg.vector_norm(each - point, dim=-1) for each in found]
         cells = [f"{float(e.square().mean().sqrt()):.4f}" if sigma else f"{float(e.max()):.1e}" for e in errors]
-        rows.append([name, *cells])
-    heads = ["at 5 km", "kcal closed form", "kcal singular values", "OpenCV", "kornia eigh", "kornia cofactor"]
-    yield from table(heads, rows)
-    yield from ["", geodesy()]
+        yield [name, *cells]
+    yield geodesy()
 
 
 def known_to() -> RigCovariance:
@@ -121,12 +130,12 @@ def known_to() -> RigCovariance:
 
 @section("locate.md", "localizer", rounds=1, points=COUNTS[:1])
 @torch.no_grad()
-def localizer(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[str]:
+def localizer(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Lines:
     plain = Localizer(rig().placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
     wide = rig()
     wide.covariance = known_to()
     known = Localizer(wide.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
-    rows = []
+    yield ["points", "marks' noise given once", "a 4x4 covariance a point", "with the calibration's covariance"]
     for count in points:
         left, right = rig()(some_points(count))[0].unbind(-2)
         cov = (0.01 * torch.eye(4, dtype=torch.float64)).expand(count, 4, 4)
@@ -135,21 +144,22 @@ def localizer(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Iterator[st
             rounds,
         )
         rate = [median([1e-6 * count / s for s in side], 3) for side in found]
-        rows.append([f"{count:.0e}", *rate])
-    heads = ["points", "marks' noise given once", "a 4x4 covariance a point", "with the calibration's covariance"]
-    return table(heads, rows)
+        yield [f"{count:.0e}", *rate]
 
 
 @section("locate.md", "coverage", draws=400)
 @torch.no_grad()
-def coverage(draws: int = 40_000) -> Iterator[str]:
+def coverage(draws: int = 40_000) -> Lines:
     """Simulated marks, and rigs drawn from their own covariance, at seven ranges."""
     there, known = rig(), known_to()
     plain = Localizer(there.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
     there.covariance = known
     wide = Localizer(there.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
     factor, generator = known.half.T, torch.Generator().manual_seed(7)
-    rows = []
+    yield [
+        "range, m", "marks only: interval", "CEP50", "CEP95", "RMS of range / bound", "with calibration: interval",
+        "interval of marks alone, same rigs",
+    ]  # fmt: skip
     for i, distance in enumerate(RANGES):
         angle = -0.3 + 0.1 * i
         point = distance * torch.tensor([[math.sin(angle), 0.02 * i - 0.06, math.cos(angle)]], dtype=torch.float64)
@@ -173,13 +183,11 @@ def coverage(draws: int = 40_000) -> Iterator[str]:
         for module in (wide, plain):
             answer = module(noisy[:, :2], noisy[:, 2:])
             shares.append(((answer.range_low <= distance) & (distance <= answer.range_high)).double().mean().item())
-        rows.append([
+        yield [
             f"{distance:.0f}", f"{100 * inside.double().mean().item():.2f} %",
             *(f"{100 * share:.1f} %" for share in circles), f"{range_rms / bound:.3f}",
             *(f"{100 * share:.2f} %" for share in shares),
-        ])  # fmt: skip
-    heads = ["range, m", "marks only: interval", "CEP50", "CEP95", "RMS of range / bound"]
-    return table([*heads, "with calibration: interval", "interval of marks alone, same rigs"], rows)
+        ]  # fmt: skip
 
 
 def _marks_of_drawn_rigs(there: Rig, point: Tensor, factor: Tensor, draws: int, generator: torch.Generator) -> Tensor:
@@ -216,3 +224,65 @@ def geodesy() -> str:
         "ENU to latitude, longitude, height by kcal and back by PROJ: largest difference "
         f"{worst:.1e} m (0 to 10 km, 360 azimuths, -85° to 85°, at and beside the antimeridian)."
     )
+
+
+ROWS = (1_000, 1_000_000)
+SUFFIXES = ("csv", "geojson", "geojsonl", "kml", "cot")
+_RUN = """
+import json, sys, time
+from kcal.cli.main import main
+rig, small, large, out = sys.argv[1:]
+for points in (small, large):
+    sys.argv = ["kcal", "locate", rig, points, "-o", out]
+    start = time.process_time()
+    try:
+        main()
+    except SystemExit as end:
+        assert not end.code, end.code
+from scripts.shared.memory import peak_megabytes
+print(json.dumps({"seconds": time.process_time() - start, "megabytes": peak_megabytes()}))
+"""
+
+
+def write_table(path: Path, count: int) -> Path:
+    """Marks with 0.1 px of noise."""
+    with torch.no_grad():
+        left, right = rig()(some_points(count))[0].unbind(-2)
+    marks = torch.cat([left, right], -1)
+    marks += 0.1 * torch.randn(marks.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    with path.open("w") as file:
+        file.write("name,left_u,left_v,right_u,right_v\n")
+        for i, row in enumerate(marks.tolist()):
+            file.write(f"p{i},{','.join(map(repr, row))}\n")
+    return path
+
+
+def _rows(folder: Path, suffixes: tuple[str, ...], counts: tuple[int, ...], repeat: int) -> Iterator[list[str]]:
+    """After a table of one row."""
+    exact, known = rig(), rig()
+    exact.mounting = Mounting(origin=ORIGIN, heading_deg=35.0)
+    known.mounting = Mounting(
+        origin=ORIGIN, heading_deg=35.0, covariance=mounting_covariance(origin_m=[0.05] * 3, attitude_deg=[0.005] * 3)
+    )
+    known.covariance = known_to()
+    rigs = {"exact": save_rig(exact, folder / "exact.json"), "with covariances": save_rig(known, folder / "known.json")}
+    tables = {count: write_table(folder / f"{count}.csv", count) for count in [1, *counts]}
+    for suffix in suffixes:
+        for name, path in rigs.items():
+            if name != "exact" and suffix not in ("csv", "geojson"):
+                continue
+            out = folder / f"out.{suffix}"
+            for count in counts:
+                command = sys.executable, "-c", _RUN, path, tables[1], tables[count], out
+                found = [answer(*command) for _ in range(repeat)]
+                seconds, peak = min(each["seconds"] for each in found), max(each["megabytes"] for each in found)
+                yield [f".{suffix}", name, f"{count:,}", f"{count / seconds:,.0f}", f"{peak:.0f}"]
+                out.unlink()
+
+
+@section("locate.md", "tables", rows=(1000,), formats=("csv",), repeat=1)
+def tables(rows: tuple[int, ...] = ROWS, formats: tuple[str, ...] = SUFFIXES, repeat: int = 3) -> Iterator[str]:
+    """Each format with each rig."""
+    with tempfile.TemporaryDirectory() as name:
+        made = _rows(Path(name), formats, rows, repeat)
+        yield from table(["file", "rig", "rows", "rows a second of processor time", "peak MB"], made)

@@ -18,7 +18,7 @@ import numpy as np
 
 from kcal import Camera, load_rig, save_camera, save_rig
 from kcal.rig import Mounting
-from scripts.bench.locate_table import write_table
+from scripts.bench.locate import write_table
 from scripts.shared.children import answer
 from scripts.shared.long_range import ORIGIN, rig
 from scripts.shared.page import table

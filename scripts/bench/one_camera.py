@@ -6,7 +6,7 @@ KCAL_LENSBOY name interpreters that have them; elsewhere their cells stay as the
 
 On each held-out view only its pose is solved again; camera and board stay as fitted. Measure: sqrt(sum w² |r|² / count)
 over all folds, with the weights of the file (OpenCV's images: all one). Epipolar error:
-Sampson's distance of held-out corners in pixels, which needs no board.
+Sampson's distance of held-out corners in pixels, which needs no board. *fields*: kinds of fields of the hybrid lens.
 """
 
 from __future__ import annotations
@@ -22,10 +22,13 @@ from torch import Tensor
 
 from kcal import Camera, Observations, Rig, RigOptions, calibrate_rig
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.hybrid.fit import fit_hybrid
+from kcal.calibrate.hybrid.fit import FitOptions, fit_hybrid
+from kcal.lens.field_modes import GaussianModes, NetworkModes
+from kcal.lens.zernike import ZernikeModes
+from kcal.nets import FieldTraining
 from scripts.shared.children import interpreter
-from scripts.shared.mrcal_spline import splined
-from scripts.shared.page import merged
+from scripts.shared.page import Lines, merged
+from scripts.shared.peer_lenses import splined
 from scripts.shared.real_captures import stereo_images
 from scripts.shared.sections import section
 from scripts.shared.wide_lens import folds, load, over_parts, warped
@@ -41,13 +44,14 @@ SPLITS = {"blocks20": "whole blocks of views", "evenodd": "every other view"}
 Fitter = Callable[[Observations, Tensor], tuple[Camera, Tensor]]
 
 
-def hybrid(seen: Observations, weight: Tensor) -> tuple[Camera, Tensor]:
-    found = fit_hybrid(seen.board.points, seen.pixels(), seen.image_size, weight)
-    print(
-        f"    sigma {found.sigma:.3f} px, tempering {found.tempering:.2f}, {found.effective:.1f} effective parameters",
-        flush=True,
-    )
-    return found.camera, found.board_points
+def by_evidence(options: FitOptions | None = None) -> Fitter:
+    def fit(seen: Observations, weight: Tensor) -> tuple[Camera, Tensor]:
+        found = fit_hybrid(seen.board.points, seen.pixels(), seen.image_size, weight, options)
+        told = f"sigma {found.sigma:.3f} px, tempering {found.tempering:.2f}"
+        print(f"    {told}, {found.effective:.1f} effective parameters", flush=True)
+        return found.camera, found.board_points
+
+    return fit
 
 
 def parametric(model: str, weak_prior: float | None) -> Fitter:
@@ -60,7 +64,7 @@ def parametric(model: str, weak_prior: float | None) -> Fitter:
 
 
 MODELS: dict[str, Fitter] = {
-    "hybrid": hybrid,
+    "hybrid": by_evidence(),
     "opencv5": parametric("opencv5", None),
     "opencv14, weak prior": parametric("opencv14", 0.3),
     "ext20, weak prior": parametric("ext20", 0.3),
@@ -115,6 +119,11 @@ def measure_epipolar(name: str, sides: list[Observations]) -> float:
     return float(torch.cat(errors).square().mean().sqrt())
 
 
+def by_views(seen: Observations) -> tuple[Tensor, list[np.ndarray]]:
+    """Weights (V, N) that are all alike, and parts of one view each."""
+    return torch.isfinite(seen.pixels()).all(-1).double(), [np.array([i]) for i in range(len(seen.views))]
+
+
 def cases(few: int) -> Iterator[tuple[str, Callable[[str], str], bool]]:
     """What is held out, the cell of a model, and whether other programs can do it."""
     seen, weights = load()
@@ -125,12 +134,9 @@ def cases(few: int) -> Iterator[tuple[str, Callable[[str], str], bool]]:
         yield f"wide lens, {words}", functools.partial(measure, seen=seen, weight=weight, parts=parts), True
     sides = [stereo_images(side) for side in ("left", "right")]
     for side, one in zip(("left", "right"), sides, strict=True):
-        all_seen = torch.isfinite(one.pixels()).all(-1).double()
-        each = [np.array([i]) for i in range(len(one.views))]
-        yield (
-            f"OpenCV's images, {side}, each view",
-            functools.partial(measure, seen=one, weight=all_seen, parts=each), False,
-        )  # fmt: skip
+        weight, parts = by_views(one)
+        cell = functools.partial(measure, seen=one, weight=weight, parts=parts)
+        yield f"OpenCV's images, {side}, each view", cell, False
     yield "OpenCV's pairs, 4 of 13", lambda name: f"{measure_epipolar(name, sides):.4f}", False
 
 
@@ -138,12 +144,33 @@ def cases(few: int) -> Iterator[tuple[str, Callable[[str], str], bool]]:
 def held_out_views(models: tuple[str, ...] = tuple(MODELS), views: int = 8, only: str = "") -> Iterator[str]:
     """With so many views of the wide lens fitted in one of its rows; only rows whose name contains this."""
     peers = [name for name, (peer, _) in PEERS.items() if interpreter(peer)]
-    rows = (
-        [
-            what,
-            *(cell(name) if name in (*models, *(peers if able else ())) else None for name in (*MODELS, *PEERS)),
-        ]
-        for what, cell, able in cases(views)
-        if only in what
-    )
+    rows = []
+    for what, cell, able in cases(views):
+        if only in what:
+            wanted = (*models, *(peers if able else ()))
+            rows.append([what, *(cell(name) if name in wanted else None for name in (*MODELS, *PEERS))])
     return merged("one-camera.md", "held-out", ["held out", *MODELS, *PEERS], rows)
+
+
+TRAINED = 40
+# Kinds of fields of the hybrid lens.
+KINDS = {
+    "zernike": FitOptions(modes=ZernikeModes()),
+    "gaussian, 3 widths": FitOptions(modes=GaussianModes()),
+    "gaussian, 4 widths": FitOptions(modes=GaussianModes(widths=(1.0, 0.5, 0.25, 0.125))),
+    "network, 60 random features": FitOptions(modes=NetworkModes.random(60)),
+    f"network, {TRAINED} trained features": FitOptions(modes=NetworkModes.random(TRAINED), training=FieldTraining()),
+}
+
+
+@section("one-camera.md", "fields", wide_folds=1, stereo_folds=1, kinds=("zernike",))
+def fields(wide_folds: int = 5, stereo_folds: int = 13, kinds: tuple[str, ...] = tuple(KINDS)) -> Lines:
+    seen, weights = load()
+    cases = {"wide lens, whole blocks": (seen, torch.from_numpy(weights), folds("blocks20", len(weights))[:wide_folds])}
+    for side in ("left", "right"):
+        weight, parts = by_views(seen := stereo_images(side))
+        cases[f"{side}, each view"] = seen, weight, parts[:stereo_folds]
+    yield ["field", *cases, "CPU s, wide lens"]
+    for kind in kinds:
+        found = [over_parts(by_evidence(KINDS[kind]), *case) for case in cases.values()]
+        yield [kind, *(f"{error:.4f}" for error, _ in found), f"{found[0][1]:.1f}"]

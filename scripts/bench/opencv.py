@@ -10,8 +10,7 @@ from __future__ import annotations
 import functools
 import itertools
 import statistics
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -23,10 +22,11 @@ from kcal import Camera, Observations, RigOptions, calibrate_rig
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.report.judge_rig import triangulated_sides
 from kcal.rig import pair_by_name
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.peer_lenses import calibrated
 from scripts.shared.real_captures import stereo_images
 from scripts.shared.sections import section
+from scripts.shared.timing import times
 
 CRITERIA = (3, 300, 1e-12)
 MODELS = ("opencv5", "opencv8", "opencv12", "opencv14")
@@ -43,8 +43,8 @@ def _observe(side: str) -> Observations:
 
 
 @section("other-programs.md", "opencv, projection")
-def projection() -> Iterator[str]:
-    rows = []
+def projection() -> Lines:
+    yield ["coefficients", "largest difference, px"]
     generator = np.random.default_rng(0)
     lens = generator.normal(size=14) * [0.2, 0.05, 1e-3, 1e-3, 0.02, 0.05, 0.02, 0.01, *[1e-3] * 4, 0.02, 0.02]
     points = generator.uniform(-1, 1, (2000, 3)) * [1.2, 0.7, 0.5] + [0, 0, 2]
@@ -60,27 +60,24 @@ def projection() -> Iterator[str]:
         )
         ours, valid = camera.project(torch.from_numpy(points))
         difference = np.abs(ours.numpy() - theirs)[valid.numpy()].max()
-        rows.append([count, f"{difference:.1e} ({int(valid.sum())} points)"])
-    return table(["coefficients", "largest difference, px"], rows)
+        yield [count, f"{difference:.1e} ({int(valid.sum())} points)"]
 
 
 @section("other-programs.md", "opencv, cameras", repeats=1, models=("opencv5",))
-def cameras(repeats: int = 5, models: tuple[str, ...] = MODELS) -> Iterator[str]:
-    rows = []
+def cameras(repeats: int = 5, models: tuple[str, ...] = MODELS) -> Lines:
+    yield ["camera", "model", "RMS kcal, px", "RMS OpenCV", "difference", "kcal, ms", "OpenCV, ms", "ratio"]
     for side, model in itertools.product(("left", "right"), models):
         options = CalibrationOptions(model=model, weak_prior=None, weighted=False)
         seen = _observe(side)
         count = int(model.removeprefix("opencv"))
-        ours, theirs, times = _in_turn(
+        ours, theirs, spent = _in_turn(
             partial(calibrate_camera, seen, options), partial(calibrated, seen, count, criteria=CRITERIA), repeats
         )
-        ratios = [a / b for a, b in zip(*times, strict=True)]
-        rows.append([
+        ratios = [a / b for a, b in zip(*spent, strict=True)]
+        yield [
             side, model, f"{ours.rms:.7f}", f"{theirs[0]:.7f}", f"{ours.rms - theirs[0]:+.1e}",
-            _median(times[0], 1e3), _median(times[1], 1e3), _median(ratios),
-        ])  # fmt: skip
-    heads = ["camera", "model", "RMS kcal, px", "RMS OpenCV", "difference", "kcal, ms", "OpenCV, ms", "ratio"]
-    return table(heads, rows)
+            _median(spent[0], 1e3), _median(spent[1], 1e3), _median(ratios),
+        ]  # fmt: skip
 
 
 def _median(values: list[float], factor: float = 1.0) -> str:
@@ -89,15 +86,8 @@ def _median(values: list[float], factor: float = 1.0) -> str:
 
 
 def _in_turn(first: Callable[[], Any], second: Callable[[], Any], repeats: int) -> tuple[Any, Any, list[list[float]]]:
-    """Results of both, and their seconds; one run of each first, not counted."""
-    results = [first(), second()]
-    times: list[list[float]] = [[], []]
-    for _ in range(repeats):
-        for which, call in enumerate((first, second)):
-            start = time.perf_counter()
-            results[which] = call()
-            times[which].append(time.perf_counter() - start)
-    return results[0], results[1], times
+    """Results of both, and their seconds."""
+    return first(), second(), times((first, second), repeats)
 
 
 def _points(observations: Observations, also: Observations | None = None) -> tuple[list[Any], list[Any]]:
@@ -111,25 +101,24 @@ def _points(observations: Observations, also: Observations | None = None) -> tup
 
 
 @section("other-programs.md", "opencv, rig", repeats=1)
-def rig(repeats: int = 5) -> Iterator[str]:
-    rows = []
+def rig(repeats: int = 5) -> Lines:
+    yield ["intrinsics", "side", "baseline, mm", "RMS, px", "squares, mm", "ms"]
     left, right = _observe("left"), _observe("right")
     five = CalibrationOptions(model="opencv5")
     both = (calibrate_camera(left, five).camera, calibrate_camera(right, five).camera)
     pairs = pair_by_name(left.names, right.names)
     for word, refine in (("fixed", False), ("refined jointly", True)):
         options = RigOptions(intrinsics="free" if refine else "fixed", reject=False)
-        ours, theirs, times = _in_turn(
+        ours, theirs, spent = _in_turn(
             partial(calibrate_rig, *both, left, right, pairs, options),
             partial(_opencv_stereo, left, right, both, refine),
             repeats,
         )
         side = triangulated_sides(ours.stereo(), left.board.columns, left.board.rows, ours.pixels)
         found = ours.rms, float(ours.stereo().baseline), side.mean, side.spread
-        for who, (rms, baseline, mean, spread), spent in zip(("kcal", "OpenCV"), (found, theirs), times, strict=True):
+        for who, (rms, baseline, mean, spread), own in zip(("kcal", "OpenCV"), (found, theirs), spent, strict=True):
             squares = f"{1e3 * mean:.4f} ± {1e3 * spread:.4f}"
-            rows.append([word, who, f"{1e3 * baseline:.5f}", f"{rms:.7f}", squares, _median(spent, 1e3)])
-    return table(["intrinsics", "side", "baseline, mm", "RMS, px", "squares, mm", "ms"], rows)
+            yield [word, who, f"{1e3 * baseline:.5f}", f"{rms:.7f}", squares, _median(own, 1e3)]
 
 
 def _opencv_stereo(

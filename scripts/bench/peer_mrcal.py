@@ -42,6 +42,21 @@ def problem(intrinsics: Any, extrinsics: Any, frames: Any, seen: Any, index: Any
     }  # fmt: skip
 
 
+def seeded(seen: Any, index: Any, focal: float, common: dict[str, Any], frees: tuple[bool, ...]) -> tuple[Any, ...]:
+    """A stereographic seed, refined with the core of the lens held and free: intrinsics, extrinsics and frames."""
+    intrinsics, extrinsics, frames = mrcal.seed_stereographic(
+        imagersizes=common["imagersizes"], focal_estimate=focal, indices_frame_camera=index[:, :2].copy(),
+        observations=seen, object_spacing=common["calibration_object_spacing"],
+    )  # fmt: skip
+    for free in frees:
+        mrcal.optimize(
+            **problem(intrinsics, extrinsics, frames, seen, index), lensmodel="LENSMODEL_STEREOGRAPHIC",
+            do_optimize_intrinsics_core=free, do_optimize_intrinsics_distortions=False,
+            do_optimize_calobject_warp=False, do_apply_regularization=False, **common,
+        )  # fmt: skip
+    return intrinsics, extrinsics, frames
+
+
 def main() -> None:
     with np.load(sys.argv[1]) as data:
         corners, weight, train, held = data["corners"], data["weight"], data["train"], data["held"]
@@ -54,19 +69,8 @@ def main() -> None:
     seen, index = arrays(corners[train], weight[train], (rows, columns))
 
     cpu = time.process_time()
-    intrinsics, extrinsics, frames = mrcal.seed_stereographic(
-        imagersizes=size,
-        focal_estimate=focal,
-        indices_frame_camera=index[:, :2].copy(),
-        observations=seen,
-        object_spacing=square,
-    )
-    for free in (False,) if len(sys.argv) > 3 else (False, True):
-        mrcal.optimize(
-            **problem(intrinsics, extrinsics, frames, seen, index), lensmodel="LENSMODEL_STEREOGRAPHIC",
-            do_optimize_intrinsics_core=free, do_optimize_intrinsics_distortions=False,
-            do_optimize_calobject_warp=False, do_apply_regularization=False, **common,
-        )  # fmt: skip
+    frees = (False,) if len(sys.argv) > 3 else (False, True)
+    intrinsics, _, frames = seeded(seen, index, focal, common, frees)
     small = (np.random.default_rng(0).random(mrcal.lensmodel_num_params(lens) - 4) - 0.5) * 2e-6
     intrinsics, warp = np.concatenate([intrinsics, small[None]], 1), np.zeros(2)
 

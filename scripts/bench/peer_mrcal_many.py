@@ -22,7 +22,8 @@ _LENS = "LENSMODEL_OPENCV8"
 
 def main() -> None:
     sys.path.append(str(Path(__file__).parents[2]))
-    from scripts.bench.peer_mrcal import problem
+    from scripts.bench.peer_mrcal import problem, seeded
+    from scripts.shared.memory import peak_megabytes
 
     with np.load(sys.argv[1]) as data:
         corners, size, (columns, rows) = data["corners"], data["image_size"].astype(np.int32), data["board_size"]
@@ -38,16 +39,7 @@ def main() -> None:
         "do_apply_outlier_rejection": False,
     }  # fmt: skip
     cpu = time.process_time()
-    intrinsics, extrinsics, frames = mrcal.seed_stereographic(
-        imagersizes=common["imagersizes"], focal_estimate=focal, indices_frame_camera=index[:, :2].copy(),
-        observations=seen, object_spacing=square,
-    )  # fmt: skip
-    for free in (False, True):
-        mrcal.optimize(
-            **problem(intrinsics, extrinsics, frames, seen, index), lensmodel="LENSMODEL_STEREOGRAPHIC",
-            do_optimize_intrinsics_core=free, do_optimize_intrinsics_distortions=False,
-            do_optimize_calobject_warp=False, do_apply_regularization=False, **common,
-        )  # fmt: skip
+    intrinsics, extrinsics, frames = seeded(seen, index, focal, common, (False, True))
     small = (np.random.default_rng(0).random((cameras, mrcal.lensmodel_num_params(_LENS) - 4)) - 0.5) * 2e-6
     intrinsics, warp = np.concatenate([intrinsics, small], 1), np.zeros(2)
     for warped in (False, True):
@@ -60,10 +52,8 @@ def main() -> None:
     cpu = time.process_time() - cpu
     turns = np.concatenate([np.eye(3)[None], mrcal.R_from_r(extrinsics[:, :3])])
     shift = np.concatenate([np.zeros((1, 3)), extrinsics[:, 3:]])
-    status = Path("/proc/self/status").read_text().splitlines()
-    peak = int(next(line.split()[1] for line in status if line.startswith("VmHWM"))) / 1024
     center = -np.einsum("cji,cj->ci", turns, shift)
-    print(json.dumps({"cpu": cpu, "peak": peak, "center": center.tolist(), "rotation": turns.tolist()}))
+    print(json.dumps({"cpu": cpu, "peak": peak_megabytes(), "center": center.tolist(), "rotation": turns.tolist()}))
 
 
 if __name__ == "__main__":

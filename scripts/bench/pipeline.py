@@ -9,7 +9,7 @@ their image in both. One graph is compiled for any number of pairs from two; a s
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -22,9 +22,9 @@ from kcal.pipeline.association import associate
 from kcal.rig import RigCovariance, planned_rig
 from kcal.track import Detections, ObjectDisparity
 from scripts.check.pairing import OPTIONS, SIZE, site_rig
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
-from scripts.shared.timing import children_seconds
+from scripts.shared.timing import children_seconds, times
 
 COUNTS = (1, 10, 100)
 PAIRS = 4096
@@ -52,15 +52,8 @@ def processor() -> float:
 
 def spent(calls: list[Callable[[], object]], rounds: int = 9) -> list[str]:
     """Median milliseconds of processor time of each call; in each round every call runs once."""
-    found: list[list[float]] = [[] for _ in calls]
-    for _ in range(rounds + 1):
-        for call, each in zip(calls, found, strict=True):
-            start = time.process_time()
-            call()
-            each.append(1e3 * (time.process_time() - start))
-    return [
-        f"{np.median(each[1:]):.2g}" if np.median(each[1:]) < 10 else f"{np.median(each[1:]):.0f}" for each in found
-    ]
+    middles = [1e3 * float(np.median(each)) for each in times(calls, rounds, time.process_time)]
+    return [f"{middle:.2g}" if middle < 10 else f"{middle:.0f}" for middle in middles]
 
 
 def localizer(lens: str) -> tuple[Localizer, Tensor, Tensor]:
@@ -87,7 +80,7 @@ def backward(call: Callable[..., Tensor], *inputs: Tensor) -> None:
 
 
 @section("pairing.md", "gradients", lenses=("pinhole", "opencv5"))
-def gradients(lenses: tuple[str, ...] = tuple(LENSES)) -> Iterator[str]:
+def gradients(lenses: tuple[str, ...] = tuple(LENSES)) -> Lines:
     """Tables: compiling, and derivatives beside kornia."""
     made = {lens: localizer(lens) for lens in lenses}
     rows = []
@@ -113,8 +106,8 @@ def gradients(lenses: tuple[str, ...] = tuple(LENSES)) -> Iterator[str]:
         f"{what}, {how}, ms" for what in ("100", PAIRS, f"{PAIRS} with gradients") for how in ("eager", "compiled")
     ]
     yield "Processor time of `Localizer`, one thread:"
-    yield ""
-    yield from table(heads, rows)
+    yield heads
+    yield from rows
     camera = made["opencv5"][0].rig.left
     pixels, K, d = made["opencv5"][1], camera.matrix, camera.coefficients
     rays = camera.unproject(pixels)[0]
@@ -137,11 +130,10 @@ def gradients(lenses: tuple[str, ...] = tuple(LENSES)) -> Iterator[str]:
             lambda: backward(lambda x, y: triangulate_points(P[None], Q[None], x[None], y[None]), a, b),
         ],
     }
-    yield from ["", "Millions of points a second, forward and backward:", ""]
-    found = ((name, map(float, spent(both))) for name, both in each.items())
-    yield from table(
-        ["", "kcal", "kornia"], ([name, *(f"{1e-3 * PAIRS / value:.2g}" for value in both)] for name, both in found)
-    )
+    yield "Millions of points a second, forward and backward:"
+    yield ["", "kcal", "kornia"]
+    for name, both in each.items():
+        yield [name, *(f"{1e-3 * PAIRS / float(value):.2g}" for value in spent(both))]
 
 
 def boxes(pixels: Tensor) -> Detections:
@@ -150,7 +142,7 @@ def boxes(pixels: Tensor) -> Detections:
 
 
 @section("pairing.md", "latency", calls=3, eager=True)
-def latency(calls: int = 200, eager: bool = False) -> Iterator[str]:
+def latency(calls: int = 200, eager: bool = False) -> Lines:
     """So many calls of each; `eager` leaves out the compiled one."""
     rig = site_rig()
     localize = Localizer(rig.placed(origin=Origin(lat=19.07, lon=72.87, height=14.0), heading_deg=35.0))
@@ -192,5 +184,5 @@ def latency(calls: int = 200, eager: bool = False) -> Iterator[str]:
         rows.append([count, *(milliseconds(call, calls) for call in work)])
     heads = ["objects", "localize, eager", *(["localize, compiled"] if not eager else []), "associate", "match"]
     yield "Milliseconds a call: median / 99th percentile (processor time, mean)."
-    yield ""
-    yield from table(heads, rows)
+    yield heads
+    yield from rows

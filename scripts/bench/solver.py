@@ -10,6 +10,7 @@ lens that folds between the corners is no lens: such a solution is marked, and d
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import statistics
@@ -56,10 +57,6 @@ def with_kcal(data: dict[str, np.ndarray], coefficients: int, weak: float | None
     vector = result.camera.params.detach().numpy()
     poses = result.cam_from_board_rotation.numpy(), result.cam_from_board_translation.numpy()
     return vector[:4], vector[5:], *poses, seconds
-
-
-def with_weak_prior(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...]:
-    return with_kcal(data, coefficients, WEAK)
 
 
 def with_opencv(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...]:
@@ -161,9 +158,9 @@ def with_ceres(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...
     return shared[:4], shared[4:], rotation, np.array(poses)[:, 3:], seconds
 
 
-SOLVERS = {
+SOLVERS: dict[str, Any] = {
     "kcal": with_kcal,
-    "kcal, weak prior": with_weak_prior,
+    "kcal, weak prior": functools.partial(with_kcal, weak=WEAK),
     "OpenCV": with_opencv,
     "Ceres": with_ceres,
     "mrcal": with_mrcal,

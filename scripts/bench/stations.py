@@ -7,9 +7,7 @@ of noise; lenses have five coefficients, kcal fits its default.
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import subprocess
 import sys
 import tempfile
@@ -22,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Board, Camera, Localizer, Observations, RigData, View, calibrate_camera, save_rig, solve_rig
+from kcal import Board, Camera, Localizer, RigData, calibrate_camera, save_rig, solve_rig
 from kcal.calibrate.rig.pairs import boards_of_several
 from kcal.lens import rotation_from_vector
 from kcal.lens.pair_errors import RigCovariance
@@ -30,12 +28,13 @@ from kcal.lens.rig import Mounting, Origin, Rig
 from kcal.locate import terrain
 from kcal.locate.siting import Site, area_of, rank_sites, siting_map
 from kcal.rig import planned_rig
-from scripts.shared.children import interpreter
+from scripts.shared.children import answer, interpreter
 from scripts.shared.memory import peak_megabytes
-from scripts.shared.page import DOCS, table
+from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.sections import section
 from scripts.shared.station_scenes import drawn_errors, hills, marks, ring, targets
-from scripts.shared.timing import children_seconds, show
+from scripts.shared.timing import children_seconds, show, times
+from scripts.shared.traced import as_observations
 
 _CORNER, _CELL = (44.75, 5.72), 0.0014
 _TOWERS = (("mill", 44.9, 5.85), ("church", 45.1, 5.9), ("mast", 45.15, 6.15), ("hill", 44.87, 6.1), ("dam", 45.0, 6.0))
@@ -56,7 +55,7 @@ def _hilltop(ground: Tensor, name: str, lat: float, lon: float) -> Site:
 
 
 @section("stations.md", "sites", cells=20)
-def sites(cells: int = 200, write: bool = False) -> Iterator[str]:
+def sites(cells: int = 200, write: bool = False) -> Lines:
     """Time of a map and of the order of candidates, and the picture of the how-to page."""
     from kcal.report.figures import save_picture
     from kcal.report.positions import siting_figure
@@ -88,12 +87,12 @@ def sites(cells: int = 200, write: bool = False) -> Iterator[str]:
     lap("10 candidates, all in order")
     if write:
         save_picture(DOCS.parent / "howto" / "sites.png", siting_figure(area, towers, ranked))
-    yield from table(["step", "CPU s"], rows)
-    yield from ["", f"Peak memory {peak_megabytes():.0f} MB, libraries included."]
+    yield from [["step", "CPU s"], *rows]
+    yield f"Peak memory {peak_megabytes():.0f} MB, libraries included."
 
 
 @section("stations.md", "frame", rounds=1)
-def frame(rounds: int = 20) -> Iterator[str]:
+def frame(rounds: int = 20) -> Lines:
     """Milliseconds of 1,000 detections in 8 cameras."""
     rig, generator = ring(8, 5000.0), torch.Generator().manual_seed(0)
     root = rig.with_errors(position_m=0.3, attitude_deg=(0.004, 0.004, 0.02), refraction=0.1)
@@ -102,24 +101,20 @@ def frame(rounds: int = 20) -> Iterator[str]:
     spoiled = seen.clone()
     spoiled[torch.rand(1000, 8, generator=generator) < 0.1] = math.nan
     spoiled[torch.rand(1000, 8, generator=generator) < 0.05] += 60.0
-    rows = []
+    yield ["marks", "errors", "CPU ms a frame"]
     for name, pixels in (("all seen, none wrong", seen), ("10 % missing, 5 % wrong", spoiled)):
         for errors, known in (("marks alone", torch.zeros(1, rig.quantities).double()), ("all errors", root)):
             localize = Localizer(rig, root=known, pixel_sigma=0.3)
-            spent = []
             with torch.no_grad():
-                for _ in range(rounds + 1):
-                    start = time.process_time()
-                    localize(pixels)
-                    spent.append(time.process_time() - start)
-            rows.append([name, errors, f"{1e3 * float(np.median(spent[1:])):.0f}"])
-    return table(["marks", "errors", "CPU ms a frame"], rows)
+                (spent,) = times([lambda: localize(pixels)], rounds, time.process_time)  # noqa: B023
+            yield [name, errors, f"{1e3 * float(np.median(spent)):.0f}"]
 
 
 @section("stations.md", "two", pairs=1000)
-def two(pairs: int = 200_000) -> Iterator[str]:
+def two(pairs: int = 200_000) -> Lines:
     """Two ways to weigh two cameras, on the same pairs of marks."""
-    rows, generator = [], torch.Generator().manual_seed(0)
+    yield ["errors", "weights by marks, CPU s per million", "by all errors", "times", "median difference in σ"]
+    generator = torch.Generator().manual_seed(0)
     for name, pose in (("marks alone", None), ("and lenses and pose", 1e-10 * torch.eye(6).double())):
         rig = planned_rig()
         rig.mounting = Mounting(origin=Origin(lat=45.0, lon=6.0, height=800.0), heading_deg=35.0, pitch_deg=-1.0)
@@ -139,14 +134,10 @@ def two(pairs: int = 200_000) -> Iterator[str]:
         sigma = ours.covariance[both].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
         off = (ours.enu - theirs.enu)[both].norm(dim=-1) / sigma
         each = 1e6 / pairs
-        rows.append([
+        yield [
             name, f"{by_pair * each:.2f}", f"{by_views * each:.1f}", f"{by_views / by_pair:.1f}",
             f"{float(off.median()):.1e}",
-        ])  # fmt: skip
-    return table(
-        ["errors", "weights by marks, CPU s per million", "by all errors", "times", "median difference in σ"],
-        rows,
-    )
+        ]  # fmt: skip
 
 
 def _timed(localize: torch.nn.Module, *marked: Tensor) -> tuple[Any, float]:
@@ -157,9 +148,10 @@ def _timed(localize: torch.nn.Module, *marked: Tensor) -> tuple[Any, float]:
 
 
 @section("stations.md", "table", sizes=(300,))
-def long_tables(sizes: tuple[int, ...] = (100_000, 1_000_000)) -> Iterator[str]:
+def long_tables(sizes: tuple[int, ...] = (100_000, 1_000_000)) -> Lines:
     """CPU seconds and peak memory of `kcal locate` of marks of three cameras, in a process of its own."""
-    rig, rows = ring(3, 5000.0), []
+    yield ["lines", "positions", "CPU s", "peak MB"]
+    rig = ring(3, 5000.0)
     rig.root = rig.with_errors(attitude_deg=0.01)
     for size in sizes:
         with tempfile.TemporaryDirectory() as folder:
@@ -183,8 +175,7 @@ def long_tables(sizes: tuple[int, ...] = (100_000, 1_000_000)) -> Iterator[str]:
             peak = float(done.stderr.split("peak ")[-1])
             with Path(folder, "out.csv").open() as file:
                 lines = sum(1 for _ in file) - 1
-            rows.append([f"{3 * things:,}", f"{lines:,}", f"{spent:.0f}", f"{peak:.0f}"])
-    return table(["lines", "positions", "CPU s", "peak MB"], rows)
+            yield [f"{3 * things:,}", f"{lines:,}", f"{spent:.0f}", f"{peak:.0f}"]
 
 
 @section("stations.md", "many", sizes=(2, 4))
@@ -227,36 +218,24 @@ def together(cameras: int, views: int) -> Iterator[list[str]]:
             moments.append((pixels + _NOISE_PX * draw(*pixels.shape)).movedim(1, 0))
     corners = torch.stack(moments)  # (V, C, N, 2)
     start = time.process_time()
-    observed = {
-        c: Observations(board=board, image_size=(1920, 1080), views=tuple(
-            View(name=f"{i:03d}.png", pixels=tuple((u, v) for u, v in corners[i, c].tolist())) for i in range(views)))
-        for c in range(cameras)
-    }  # fmt: skip
+    observed = {c: as_observations(corners[:, c], (1920, 1080), board) for c in range(cameras)}
     calibrated = tuple(calibrate_camera(one).camera for one in observed.values())
     alone = time.process_time() - start
     data = RigData(cameras=calibrated, names=rig.names, boards=boards_of_several(calibrated, rig.names, observed))
     found = solve_rig(data)
     spent = time.process_time() - start
-    yield [
-        "kcal",
-        f"{spent:.0f}",
-        f"{alone:.0f}",
-        f"{peak_megabytes():.0f}",
-        *_errors(rig, found.rotation, found.center),
-    ]
+    errors = _errors(rig, found.rotation, found.center)
+    yield ["kcal", f"{spent:.0f}", f"{alone:.0f}", f"{peak_megabytes():.0f}", *errors]
     if python := interpreter("mrcal"):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "problem.npz")
             np.savez(
                 path, corners=corners.numpy(), image_size=[1920, 1080], board_size=[9, 6], square_m=0.1, focal=1400.0
             )
-            script = Path(__file__).with_name("peer_mrcal_many.py")
-            environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-            done = subprocess.run([python, script, path], capture_output=True, text=True, env=environment)
-            if done.returncode:
-                show([done.stderr[-500:]])
+            other = answer(python, Path(__file__).with_name("peer_mrcal_many.py"), path)
+            if "failed" in other:
+                show([other["failed"]])
             else:
-                other = json.loads(done.stdout.splitlines()[-1])
                 poses = (torch.tensor(other[name], dtype=torch.float64) for name in ("rotation", "center"))
                 yield ["mrcal, OPENCV8", f"{other['cpu']:.0f}", "", f"{other['peak']:.0f}", *_errors(rig, *poses)]
 

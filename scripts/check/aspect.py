@@ -48,10 +48,7 @@ def lines(records: list[Record]) -> Iterator[str]:
     rows = []
     for stretch in sorted({record["key"][0] for record in records}):
         own = [record for record in records if record["key"][0] == stretch]
-        kinds = {
-            "by hand": [r for r in own if r["hand"]],
-            "on a stand": [r for r in own if not r["hand"]],
-        }
+        kinds = {"by hand": [r for r in own if r["hand"]], "on a stand": [r for r in own if not r["hand"]]}
         for name, part in kinds.items():
             known = [record for record in part if "refused" not in record]
             said = [record for record in known if record["said"]]

@@ -14,7 +14,6 @@ import itertools
 import math
 import statistics
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -25,7 +24,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import moving_residuals
 from kcal.sim.captures import BoardLike, BoardSize, PrintedBoard
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.real_captures import load
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import BOARD, against_truth, simulated
@@ -109,9 +108,13 @@ def real(_: str, name: str, other: str) -> Record:
     return record
 
 
-def simulated_lines(records: list[Record]) -> Iterator[str]:
+def simulated_lines(records: list[Record]) -> Lines:
     """A row for each kind of board, number of views and fit."""
-    rows, cells = [], dict[tuple[str, float, int], list[Record]]()
+    yield [
+        "views", "noise, px", "board", "fit", "captures", "found", "in 95 %, whole image", "median error, px",
+        "RMS error", "RMS stated", "CPU s",
+    ]  # fmt: skip
+    cells = dict[tuple[str, float, int], list[Record]]()
     for record in records:
         cells.setdefault(tuple(record["key"][:3]), []).append(record)
     for (kind, noise, views), own in sorted(cells.items(), key=lambda cell: cell[0][::-1]):
@@ -119,40 +122,33 @@ def simulated_lines(records: list[Record]) -> Iterator[str]:
             known = [record[fit] for record in own if "refused" not in record[fit]]
             found = statistics.fmean("corners" in record["terms"] for record in known)
             true, stated = [record["rms"] for record in known], [record["predicted"] for record in known]
-            rows.append([
+            yield [
                 views, noise, kind, fit, len(own), f"{100 * found:.0f} %" if fit == "default" else "–",
                 share(one["everywhere"] for one in known),
                 f"{statistics.median(true):.3f}", f"{rms(true):.3f}", f"{rms(stated):.3f}",
                 f"{statistics.fmean(record['cpu_s'] for record in known):.2f}",
-            ])  # fmt: skip
-    head = [
-        "views", "noise, px", "board", "fit", "captures", "found", "in 95 %, whole image", "median error, px",
-        "RMS error", "RMS stated", "CPU s",
-    ]  # fmt: skip
-    return table(head, rows)
+            ]  # fmt: skip
 
 
-def real_lines(records: list[Record]) -> Iterator[str]:
+def real_lines(records: list[Record]) -> Lines:
     """A row for each camera."""
-    rows = []
+    yield [
+        "camera", "corners are off, mm", "correlation with the other's", "RMS, px: smooth / default / other's",
+        "held out: smooth / default / other's", "f, c moved by at most, σ",
+    ]  # fmt: skip
     for record in records:
         cells = [f"{record['off_mm']:.3f}", f"{record['correlation']:.2f}"] if "off_mm" in record else ["–", "–"]
         cells += [" / ".join(f"{value:.4f}" for value in record["rms"].values())]
         held = [math.sqrt(statistics.fmean(v * v for v in values)) for values in record.get("held", {}).values()]
         cells += [" / ".join(f"{value:.4f}" for value in held) or "–"]
-        rows.append([record["key"][1], *cells, f"{record['moved']:.1f}" if "moved" in record else "–"])
-    head = [
-        "camera", "corners are off, mm", "correlation with the other's", "RMS, px: smooth / default / other's",
-        "held out: smooth / default / other's", "f, c moved by at most, σ",
-    ]  # fmt: skip
-    return table(head, rows)
+        yield [record["key"][1], *cells, f"{record['moved']:.1f}" if "moved" in record else "–"]
 
 
 @section("one-camera.md", "board-corners", seeds=range(1), views=(8,))
 def of_simulated(
     kept: Kept = NOT_KEPT, seeds: range = range(100), boards: tuple[str, ...] = ("exact", "corners"),
     views: tuple[int, ...] = VIEWS, noises: tuple[float, ...] = NOISES,
-) -> Iterator[str]:  # fmt: skip
+) -> Lines:  # fmt: skip
     keys = [
         (board, noise, count, seed) for seed, board, noise, count in itertools.product(seeds, boards, noises, views)
     ]
@@ -160,7 +156,7 @@ def of_simulated(
 
 
 @section("one-camera.md", "board-corners-real", pairs=("stereo_left",))
-def of_real(kept: Kept = NOT_KEPT, pairs: tuple[str, ...] = tuple(pair[0] for pair in PAIRS)) -> Iterator[str]:
+def of_real(kept: Kept = NOT_KEPT, pairs: tuple[str, ...] = tuple(pair[0] for pair in PAIRS)) -> Lines:
     """The pairs of cameras in KCAL_DATA that begin with these."""
     keys = [("real", *names) for pair in PAIRS if pair[0] in pairs for names in (pair, pair[::-1])]
     return real_lines(kept.records(keys, real))

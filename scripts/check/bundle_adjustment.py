@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ import torch
 from kcal import Camera, calibrate_camera
 from kcal.calibrate.camera.calibrate import CalibrationOptions
 from kcal.lens import export_cameras
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 from scripts.shared.simulated import simulated
 from scripts.shared.views import observed, simulate
@@ -211,14 +211,11 @@ def cases(seed: int) -> dict[str, tuple[Project, Camera]]:
     views = observed(simulate(VIEWS, plain, noise=0.2, seed=seed)["pixels"].tolist())
     held = calibrate_camera(views, CalibrationOptions(model="opencv4")).camera
     case = simulated(3 * seed + 1, VIEWS, 0.1, by_hand=False)
-    return {
-        "opencv4": (plain.project, held),
-        "traced lens": (case.lens.project, calibrate_camera(case.seen).camera),
-    }
+    return {"opencv4": (plain.project, held), "traced lens": (case.lens.project, calibrate_camera(case.seen).camera)}
 
 
 @section("other-programs.md", "bundle adjustment", seeds=range(1))
-def bundle_adjustment(seeds: range = range(10)) -> Iterator[str]:
+def bundle_adjustment(seeds: range = range(10)) -> Lines:
     found: dict[tuple[str, str, str], list[list[tuple[float, float]]]] = {}
     with tempfile.TemporaryDirectory() as name:
         for seed in seeds:
@@ -229,10 +226,8 @@ def bundle_adjustment(seeds: range = range(10)) -> Iterator[str]:
                         done = [adjust(scene, camera, way, Path(name)) for way in WAYS]
                         figures = [(each.reprojection, structure(each.points, scene.points)) for each in done]
                         found.setdefault((lens, kind, program), []).append(figures)
-    rows = []
+    yield ["true lens", "scene", "program", *(f"{way}: reprojection, px" for way in WAYS),
+           *(f"{way}: structure, ‰" for way in WAYS)]  # fmt: skip
     for key, values in found.items():
         reprojection, error = np.moveaxis(np.median(np.array(values), 0), -1, 0)
-        rows.append([*key, *(f"{value:.3f}" for value in reprojection), *(f"{value:.3g}" for value in error)])
-    heads = ["true lens", "scene", "program", *(f"{way}: reprojection, px" for way in WAYS),
-             *(f"{way}: structure, ‰" for way in WAYS)]  # fmt: skip
-    return table(heads, rows)
+        yield [*key, *(f"{value:.3f}" for value in reprojection), *(f"{value:.3g}" for value in error)]

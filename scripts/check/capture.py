@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ from kcal.lens import rotation_from_vector
 from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_board
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 
 BOARD = Board(columns=9, rows=6, square=0.025)
@@ -129,19 +128,18 @@ def both(seed: int) -> Record:
 
 
 @section("ordinary.md", "capture", seeds=range(300, 301))
-def guidance(kept: Kept = NOT_KEPT, seeds: range = range(300, 308)) -> Iterator[str]:
+def guidance(kept: Kept = NOT_KEPT, seeds: range = range(300, 308)) -> Lines:
     """One row for each seed, and the means."""
     records = kept.records([(seed,) for seed in seeds], both)
-    head = ["seed", "σ of 20 random views, px", "true error, px", "guided views to this σ", "true error then, px"]
-    body, views, ratios = [], [], []
+    yield ["seed", "σ of 20 random views, px", "true error, px", "guided views to this σ", "true error then, px"]
+    views, ratios = [], []
     for record in sorted(records, key=lambda r: r["key"]):
         last, (sigma, error) = record["guided"][-1], record["random"]
         reached = last["sigma"] <= sigma
         views.append(last["views"])
         ratios.append(last["error"] / error)
         count = f"{last['views']:.0f}" if reached else f"not in {last['views']:.0f} ({last['sigma']:.3f} px)"
-        body.append([record["key"][0], f"{sigma:.4f}", f"{error:.4f}", count, f"{last['error']:.4f}"])
+        yield [record["key"][0], f"{sigma:.4f}", f"{error:.4f}", count, f"{last['error']:.4f}"]
     ratio = math.exp(sum(map(math.log, ratios)) / len(ratios))
     median = sorted(views)[len(views) // 2]
-    body.append(["all", "", "", f"median {median:.0f}", f"{ratio:.2f} of random (geometric mean)"])
-    return table(head, body)
+    yield ["all", "", "", f"median {median:.0f}", f"{ratio:.2f} of random (geometric mean)"]

@@ -43,10 +43,11 @@ from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, sample_board_poses
 from scripts.shared.moving_captures import Hands, MovingCapture, draw_motion, moving_capture
-from scripts.shared.page import merged, table
+from scripts.shared.page import Lines, merged
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
-from scripts.shared.simulated import against_truth, bends, simulated, view_of
+from scripts.shared.simulated import against_truth, bends, simulated
 from scripts.shared.timing import rms, share
+from scripts.shared.traced import as_observations
 
 SIGMA, FRAMES = 0.08, 6
 TERMS = ("motion", "bending")
@@ -177,9 +178,9 @@ def later(pose: Pose, seconds: float, generator: torch.Generator) -> Pose:
 
 def observed(pixels: Tensor, side: MovingCapture, inside: Tensor, kept: list[int]) -> Observations:
     """What one camera saw of the boards that both saw, with the corners' covariances."""
-    pixels = torch.where(inside[..., None], pixels, torch.nan)
-    views = tuple(view_of(str(i), pixels[i], side.covariance[i]) for i in kept)
-    return Observations(board=RIG_BOARD, image_size=CAMERA.size, views=views)
+    pixels = torch.where(inside[..., None], pixels, torch.nan)[kept]
+    names = list(map(str, kept))
+    return as_observations(pixels, CAMERA.size, RIG_BOARD, covariance=side.covariance[kept], names=names)
 
 
 def lines(name: str, records: list[Record], *terms: str) -> Iterator[str]:
@@ -239,9 +240,9 @@ def moving_lines(records: list[Record]) -> Iterator[str]:
     return merged("ordinary.md", "moving", head, rows)
 
 
-def rig_lines(records: list[Record]) -> Iterator[str]:
+def rig_lines(records: list[Record]) -> Lines:
     """One row for boards by hand and on a stand, with and without motion."""
-    rows = []
+    yield ["held by", "fit", "rigs", "refused", "χ²/6", "in 95 %", "RMS error of rotation, mrad", "of position, mm"]
     for held_by, fit in itertools.product(("hand", "stand"), ("default", "still")):
         own = [record for record in records if (record["key"][0], record["key"][2]) == (held_by, fit)]
         known = [record for record in own if "refused" not in record]
@@ -250,11 +251,7 @@ def rig_lines(records: list[Record]) -> Iterator[str]:
             mean = statistics.fmean(record["chi2"] / 6 for record in known)
             errors = [rms([record[key] for record in known]) for key in ("mrad", "mm")]
             refused = len(own) - len(known)
-            rows.append(
-                [held_by, fit, len(own), refused, f"{mean:.2f}", f"{inside:.0f} %", *(f"{e:.3f}" for e in errors)]
-            )
-    head = ["held by", "fit", "rigs", "refused", "χ²/6", "in 95 %", "RMS error of rotation, mrad", "of position, mm"]
-    return table(head, rows)
+            yield [held_by, fit, len(own), refused, f"{mean:.2f}", f"{inside:.0f} %", *(f"{e:.3f}" for e in errors)]
 
 
 def captures_of(
@@ -273,7 +270,7 @@ def rigs_of(kept: Kept, seeds: range, kinds: tuple[str, ...], fits: tuple[str, .
 def handheld(
     kept: Kept = NOT_KEPT, seeds: range = range(100), views: tuple[int, ...] = (8,),
     fits: tuple[str, ...] = ("default",),
-) -> Iterator[str]:  # fmt: skip
+) -> Lines:  # fmt: skip
     """`still`: without the terms for motion."""
     return lines("handheld", captures_of(kept, seeds, views, ("hand", "stand"), fits))
 
@@ -282,7 +279,7 @@ def handheld(
 def bent(
     kept: Kept = NOT_KEPT, seeds: range = range(100), views: tuple[int, ...] = (8,),
     fits: tuple[str, ...] = ("default",),
-) -> Iterator[str]:  # fmt: skip
+) -> Lines:  # fmt: skip
     """`stiff`: without the term for bending."""
     return lines("bent", captures_of(kept, seeds, views, ("bent", "few bent", "bent, hand"), fits), *TERMS)
 
@@ -290,14 +287,12 @@ def bent(
 @section("ordinary.md", "moving", seeds=range(1), rigs=range(1), kinds=("stand", "0.01 s apart, hand"))
 def moving(
     kept: Kept = NOT_KEPT, seeds: range = range(17), rigs: range = range(3), kinds: tuple[str, ...] = tuple(MOVING)
-) -> Iterator[str]:
+) -> Lines:
     """Captures of 16 views, and rigs, of seeds of their own."""
     still = tuple(kind for kind in kinds if not KINDS[kind].apart)
     return moving_lines([*captures_of(kept, seeds, (16,), still), *rigs_of(kept, rigs, kinds, ("default",))])
 
 
 @section("ordinary.md", "rigs", seeds=range(1))
-def rigs(
-    kept: Kept = NOT_KEPT, seeds: range = range(100), fits: tuple[str, ...] = ("default", "still")
-) -> Iterator[str]:
+def rigs(kept: Kept = NOT_KEPT, seeds: range = range(100), fits: tuple[str, ...] = ("default", "still")) -> Lines:
     return rig_lines(rigs_of(kept, seeds, ("hand", "stand"), fits))

@@ -25,6 +25,8 @@ from __future__ import annotations
 
 import functools
 import itertools
+import re
+import statistics
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -34,12 +36,95 @@ import torch
 from kcal import Camera, KcalError, Observations
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.sim.captures import TrueRig
-from scripts.check.chain_page import failures, tables
 from scripts.check.chain_rig import How, judge, targets, true_rig
+from scripts.shared.long_range import RANGES
+from scripts.shared.page import Line, table
 from scripts.shared.peer_lenses import opencv
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
-from scripts.shared.timing import show
+from scripts.shared.timing import share, show
 from scripts.shared.traced import BOARD, as_camera, capture, printed
+
+Records = Sequence[dict[str, Any]]
+
+
+def pooled(records: Records, name: str, index: Sequence[int] = range(len(RANGES))) -> float:
+    """Root of the mean over ranges of what a sum is for each target; all draws count by their targets."""
+    means = []
+    for i in index:
+        count = sum(r["sums"]["count"][i] for r in records)
+        means.append(sum(r["sums"][name][i] for r in records) / count)
+    return statistics.fmean(means) ** 0.5
+
+
+def inside(records: Records, i: int | None) -> str:
+    """Coverage at a range or at all, percent, ± its standard error by draws of the cameras."""
+    index = range(len(RANGES)) if i is None else [i]
+    shares = [sum(r["sums"]["inside"][k] for k in index) / sum(r["sums"]["count"][k] for k in index) for r in records]
+    return share(shares) if len(shares) > 1 else f"{100 * shares[0]:.1f}"
+
+
+def tables(records: Records) -> list[Line]:
+    """Errors and coverage of all chains, and what failed."""
+    rows: list[list[str]] = []
+    chains = _values(records, "chain", sort=False)
+    keys = [_values(records, key) for key in ("board", "pupil", "noise")]
+    for board, pupil, noise in itertools.product(*keys):
+        for chain in chains:
+            wanted = (board, pupil, noise, chain)
+            own = [r for r in records if (r["board"], r["pupil"], r["noise"], r["chain"]) == wanted]
+            if own:
+                corners = [f"{noise:g}"] if len(keys[2]) > 1 else []
+                rows.append([board, f"{pupil:g}", *corners, chain, *_cells(own)])
+    heads = [
+        "board", "pupil, mm/rad²", *(["corners, px"] if len(keys[2]) > 1 else []), "chain", "lenses alone, m",
+        "calibration, m", "total / bound", "in 95 %, %", "at each range, %", "without ray", "failed",
+    ]  # fmt: skip
+    draws = "Draws of lenses, boards and corners, by seed: " + ", ".join(map(str, _values(records, "draw"))) + "."
+    return [heads, *rows, draws]
+
+
+def _cells(records: Records) -> list[str]:
+    """Of one chain: errors, coverage, targets without a ray, runs that failed."""
+    good = [r for r in records if r["runs"]]
+    runs, failed = sum(r["runs"] for r in records), sum(sum(r["failed"].values()) for r in records)
+    if not good:
+        return [*["–"] * 6, f"{failed} of {failed}"]
+    alone = [value**2 for r in good for value in r["lenses_m"]]
+    lost, counted = (sum(sum(r["sums"][name]) for r in good) for name in ("lost", "count"))
+    by_range = [float(inside(good, i).split(" ")[0]) for i in range(len(RANGES))]
+    return [
+        f"{statistics.fmean(alone) ** 0.5:.0f}" if alone else "–",
+        f"{pooled(good, 'meters', (len(RANGES) - 1,)):.0f}",
+        f"{pooled(good, 'total'):.2f}",
+        inside(good, None),
+        f"{min(by_range):.1f} to {max(by_range):.1f}",
+        f"{100 * lost / (lost + counted):.1f} %",
+        f"{failed} of {runs + failed}",
+    ]
+
+
+def failures(records: Records) -> list[str]:
+    """A table of the messages of runs that failed."""
+    rows = []
+    for chain in _values(records, "chain", sort=False):
+        found: dict[str, int] = {}
+        own = [r for r in records if r["chain"] == chain]
+        for record in own:
+            for message, count in record["failed"].items():
+                kind = re.sub(r"\d[\d.e+-]*", "#", message)
+                found[kind] = found.get(kind, 0) + count
+        total = sum(r["runs"] for r in own) + sum(found.values())
+        rows += [[chain, f"{count} of {total}", message[:200]] for message, count in found.items()]
+    if not rows:
+        return ["No run failed."]
+    return [*table(["chain", "runs", "message"], rows)]
+
+
+def _values(records: Records, key: str, *, sort: bool = True) -> list[Any]:
+    """What a key has for values, in order or as they come."""
+    found = dict.fromkeys(r[key] for r in records)
+    return sorted(found) if sort else list(found)
+
 
 VIEWS = 60
 # Shares of the image that put a board of 5 cm squares at 1.3 to 0.55 m before a lens of f 1600 px.
@@ -111,7 +196,7 @@ def whole_chain(
     kept: Kept = NOT_KEPT, seeds: range = range(300, 310), boards: tuple[str, ...] = ("exact", "printed"),
     pupils: tuple[float, ...] = (0.0, 1.0, 3.0), noise: tuple[float, ...] = (0.05,),
     chains: tuple[str, ...] = tuple(CHAINS), marks: int = 24, exact: int = 4,
-) -> list[str]:  # fmt: skip
+) -> list[Line]:  # fmt: skip
     """So many draws of landmarks and marks for each; of these `exact` also without noise, for the lenses alone."""
     work = torch.no_grad()(functools.partial(cell, chains=chains, marks=marks, exact=exact))
     records = kept.records(itertools.product(seeds, boards, pupils, noise), work, lambda _: "done")

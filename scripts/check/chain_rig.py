@@ -5,7 +5,6 @@ Errors are those of the inverse range, which is Gaussian at any distance, where 
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -16,7 +15,7 @@ from kcal.locate import enu_from_cam
 from kcal.rig import placed_rig
 from kcal.sim.captures import TrueRig, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
-from scripts.shared.long_range import ORIGIN, RANGES, range_sigma
+from scripts.shared.long_range import ORIGIN, RANGES, landmarks_of, range_sigma, with_noise
 
 How = Literal["held", "prior"]
 LANDMARKS, NEAR, FAR = 12, 40.0, 400.0  # number, meters
@@ -77,26 +76,15 @@ def landmarks(rig: TrueRig, generator: torch.Generator) -> tuple[Landmarks, Land
     def uniform(*shape: int) -> Tensor:
         return torch.rand(shape, dtype=torch.float64, generator=generator)
 
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(shape, dtype=torch.float64, generator=generator)
-
     size = torch.tensor(rig.left.size, dtype=torch.float64) - 1.0
     pixels = EDGE + uniform(20 * LANDMARKS, 2) * (size - 2 * EDGE)
     distance = NEAR * (FAR / NEAR) ** uniform(20 * LANDMARKS, 1)
     points = distance * rig.left.unproject(pixels)[0]
     pixels, valid = rig(points)
-    (left, right), valid = pixels.unbind(-2), valid.all(-1)
-    kept = (valid & ((right > EDGE) & (right < size - EDGE)).all(-1)).nonzero()[:LANDMARKS, 0]
-    points, marks = points[kept] @ ENU_FROM_RIG.T, torch.stack([left, right], 1)[kept]
-    exact = Landmarks(
-        names=tuple(f"landmark {i}" for i in range(LANDMARKS)),
-        points=points,
-        sigma=torch.full_like(points, SURVEY),
-        pixels=marks,
-        pixel_sigma=LANDMARK_MARK,
-    )
-    survey, noise = SURVEY * normal(LANDMARKS, 3), LANDMARK_MARK * normal(LANDMARKS, 2, 2)
-    return dataclasses.replace(exact, points=points + survey, pixels=marks + noise), exact
+    right = pixels[:, 1]
+    kept = (valid.all(-1) & ((right > EDGE) & (right < size - EDGE)).all(-1)).nonzero()[:LANDMARKS, 0]
+    exact = landmarks_of(points[kept] @ ENU_FROM_RIG.T, pixels[kept], SURVEY, LANDMARK_MARK)
+    return with_noise(exact, generator), exact
 
 
 def localizer(cameras: tuple[Camera, Camera], seen: Landmarks, how: How) -> Localizer:

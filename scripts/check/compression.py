@@ -23,7 +23,7 @@ from kcal import Camera, Rig
 from kcal.pipeline.video_source import Videos
 from kcal.track import AssociationOptions
 from scripts.shared.object_scene import Floats, exposed, paint_plate, plate, true_box
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 
 SIZE, FOCAL, FRAMES, RATE = (320, 240), 400.0, 100, 25
@@ -100,17 +100,12 @@ def errors_of(rig: Rig, films: list[list[Tensor]], boxes: list[list[Floats]], pa
 
 
 @section("pairing.md", "compression", paces=(1.0,), qualities=(23,))
-def compression(paces: tuple[float, ...] = PACES, qualities: tuple[int, ...] = (0, 17, 23, 28)) -> Iterator[str]:
+def compression(paces: tuple[float, ...] = PACES, qualities: tuple[int, ...] = (0, 17, 23, 28)) -> Lines:
     yield (
         f"Ten plates of 16 by 12 px in {FRAMES} frames, H.264 by x264. *Pace*: 1 is some 0.4 px a frame, 0 stands "
         "still. *Lasts*: the part of each plate's error that is the same in all frames."
     )
-    yield ""
-    heads = ["pace", "CRF of x264", "RMS of disparity, px", "stated, px", "compression adds, px", "lasts, px"]
-    yield from table(heads, _rows(paces, qualities))
-
-
-def _rows(paces: tuple[float, ...], qualities: tuple[int, ...]) -> Iterator[list[object]]:
+    yield ["pace", "CRF of x264", "RMS of disparity, px", "stated, px", "compression adds, px", "lasts, px"]
     camera = Camera.build(focal=(FOCAL, FOCAL), center=(159.5, 119.5), size=SIZE, model="pinhole")
     rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
     for pace in paces:

@@ -14,28 +14,18 @@ from unittest import mock
 import torch
 from torch import Tensor
 
-from kcal import Board, Camera, Observations, Rig, RigData, View, solve_rig
+from kcal import Board, Camera, Rig, RigData, solve_rig
 from kcal.calibrate.rig import assess
 from kcal.calibrate.rig.contradictions import widen_for_fields
 from kcal.calibrate.rig.pairs import paired_boards
 from kcal.calibrate.rig.problem import RigSolution
 from kcal.finding import Finding
 from kcal.lens import rotation_from_vector, vector_from_rotation
-from scripts.check.rig import (
-    MARK,
-    NAMES,
-    STRAIGHT,
-    TRUTH,
-    generator,
-    landmarks,
-    normal,
-    seen,
-    spread,
-    tape,
-)
+from scripts.check.rig import MARK, NAMES, STRAIGHT, TRUTH, generator, landmarks, normal, seen, spread, tape
 from scripts.shared.long_range import matches_of
 from scripts.shared.page import table
 from scripts.shared.sections import section
+from scripts.shared.traced import as_observations
 
 FIELD = 0.1
 CLOSE = Camera.build(focal=(800, 800), center=(319.5, 239.5), size=(640, 480))
@@ -52,10 +42,8 @@ def field(draw: torch.Generator, size: tuple[int, int]) -> Callable[[Tensor], Te
 
 def radial(draw: torch.Generator, size: tuple[int, int]) -> Callable[[Tensor], Tensor]:
     """The same, as r³ changes it, in or out."""
-    middle, sign = (
-        torch.tensor(size, dtype=torch.float64) / 2.0,
-        1.0 - 2.0 * float(torch.rand((), generator=draw) < 0.5),
-    )
+    middle = torch.tensor(size, dtype=torch.float64) / 2.0
+    sign = 1.0 - 2.0 * float(torch.rand((), generator=draw) < 0.5)
     sides = [torch.linspace(-float(side), float(side), 25, dtype=torch.float64) for side in middle]
     cubic = torch.cartesian_prod(*sides)
     scale = sign * FIELD / float((cubic * cubic.square().sum(-1, keepdim=True)).square().mean().sqrt())
@@ -88,8 +76,8 @@ def boards(kind: str, seed: int) -> RigData:
     across = (board.points - middle)[:, :2] / (board.points - middle)[:, :2].abs().max()
     shapes = torch.stack([across[:, 0] ** 2, across[:, 1] ** 2, across.prod(-1)], -1)
     lenses = [field(draw, NEAR.left.size) for _ in NAMES]
-    sides: tuple[list[View], list[View]] = ([], [])
-    for i in range(15):
+    sides: tuple[list[Tensor], list[Tensor]] = ([], [])
+    for _ in range(15):
         points = board.points - middle
         points[:, 2] += (0.002 if "flex" in kind else 0.0) * shapes @ normal((3,), draw)
         turn = rotation_from_vector(0.35 * normal((3,), draw))
@@ -97,10 +85,9 @@ def boards(kind: str, seed: int) -> RigData:
         pixels = NEAR(points @ turn.T + place)[0]
         for c, views in enumerate(sides):
             own = pixels[:, c] + (lenses[c](pixels[:, c]) if "lens" in kind else 0.0) + MARK * normal((54, 2), draw)
-            views.append(View(name=f"{i}.png", pixels=own.tolist()))
-    left, right = (Observations(board=board, image_size=NEAR.left.size, views=tuple(views)) for views in sides)
-    names = [(view.name, view.name) for view in sides[0]]
-    pairs = paired_boards((NEAR.left, NEAR.right), (left, right), names)
+            views.append(own)
+    left, right = (as_observations(torch.stack(views), NEAR.left.size, board) for views in sides)
+    pairs = paired_boards((NEAR.left, NEAR.right), (left, right), list(zip(left.names, right.names, strict=True)))
     return RigData(cameras=(NEAR.left, NEAR.right), names=NAMES, boards=pairs)
 
 

@@ -21,7 +21,7 @@ from kcal.cli.demo import simulated_site
 from kcal.locate import Marks
 from kcal.locate.positions import position_errors
 from kcal.sim.scene import DemoScene
-from scripts.shared.page import table
+from scripts.shared.page import Line
 from scripts.shared.sections import NOT_KEPT, Kept, section
 
 
@@ -48,7 +48,7 @@ def outcome(seed: int, views: int) -> dict[str, Any]:
 
 
 @section("chain.md", "demo", seeds=range(100, 101), views=4)
-def demo(kept: Kept = NOT_KEPT, seeds: range = range(100, 140), views: int = 20) -> list[str]:
+def demo(kept: Kept = NOT_KEPT, seeds: range = range(100, 140), views: int = 20) -> list[Line]:
     """Coverage and errors of each target over the seeds."""
     records = kept.records([(seed, views) for seed in seeds], outcome, lambda _: "done")
     rows = []
@@ -71,8 +71,8 @@ def demo(kept: Kept = NOT_KEPT, seeds: range = range(100, 140), views: int = 20)
     ]
     half = 1.96 * statistics.stdev(own) / len(own) ** 0.5 if len(own) > 1 else math.nan
     return [
-        *table(["target", "range of the first seed", "located", "median error of range", "in the interval"], rows),
-        "",
+        ["target", "range of the first seed", "located", "median error of range", "in the interval"],
+        *rows,
         f"{len(records)} seeds: the 95 % intervals contain the true range in {100 * share:.1f} ± {100 * half:.1f} % of "
         f"{len(every)} cases (± from the scatter of seeds).",
     ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import onnxruntime
@@ -22,7 +22,7 @@ from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import Localization, Localizer
 from kcal.rig import RigCovariance
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 
 LENSES = ("pinhole", "opencv5", "opencv14", "ext24", "fisheye4", "hybrid")
@@ -102,12 +102,12 @@ def checked(lens: str, ways: Sequence[str]) -> list[tuple[float, float]]:
 
 
 @section("other-programs.md", "deploy", lenses=("pinhole",), ways=("trace",))
-def deploy(lenses: tuple[str, ...] = LENSES, ways: tuple[str, ...] = WAYS) -> Iterator[str]:
-    rows, worst = [], 0.0
+def deploy(lenses: tuple[str, ...] = LENSES, ways: tuple[str, ...] = WAYS) -> Lines:
+    yield ["lens", *ways]
+    worst = 0.0
     for lens in lenses:
         found = checked(lens, ways)
         worst = max(worst, *(apart for apart, _ in found))
-        rows.append([lens, *(f"{apart:.0e} ({seconds:.0f} s)" for apart, seconds in found)])
-    yield from table(["lens", *ways], rows)
+        yield [lens, *(f"{apart:.0e} ({seconds:.0f} s)" for apart, seconds in found)]
     if not worst < ALLOWED:
         raise RuntimeError(f"largest difference {worst:.1e}: more than {ALLOWED:.0e}")

@@ -18,11 +18,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal import Baseline, KcalError, Landmarks, Observations, RigData, calibrate_camera, solve_rig
+from kcal import Baseline, KcalError, Observations, RigData, calibrate_camera, solve_rig
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens import vector_from_rotation
 from scripts.check.rig import BASELINE, NAMES, STRAIGHT, TRUTH, data, generator, landmarks
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.real_captures import load, names
 from scripts.shared.sections import section
 from scripts.shared.simulated import simulated
@@ -44,16 +44,11 @@ def of_landmarks(count: int, seed: int, wrong: bool = False) -> RigCase:
     whole = landmarks(generator(seed))
     points = whole.points[:count].clone()
     points[2] += OFF * wrong
-    few = Landmarks(
-        names=whole.names[:count],
-        points=points,
-        sigma=whole.sigma[:count],
-        pixels=whole.pixels[:count],
-        pixel_sigma=whole.pixel_sigma,
+    few = dataclasses.replace(
+        whole, names=whole.names[:count], points=points, sigma=whole.sigma[:count], pixels=whole.pixels[:count]
     )
-    return RigCase(
-        RigData(cameras=(TRUTH.left, TRUTH.right), names=NAMES, landmarks=few), whole.names[2] if wrong else ""
-    )
+    sources = RigData(cameras=(TRUTH.left, TRUTH.right), names=NAMES, landmarks=few)
+    return RigCase(sources, whole.names[2] if wrong else "")
 
 
 def with_baseline(kind: str, seed: int, sigma: float) -> RigCase:
@@ -98,11 +93,8 @@ def contained(found: RigResult) -> list[bool]:
 
 
 @section("rig.md", "faults", seeds=range(1))
-def of_rigs(seeds: range = range(20)) -> Iterator[str]:
-    return table(["rigs", "refused", "named", "plain", "left out", "contained"], _rig_rows(seeds))
-
-
-def _rig_rows(seeds: range) -> Iterator[list[object]]:
+def of_rigs(seeds: range = range(20)) -> Lines:
+    yield ["rigs", "refused", "named", "plain", "left out", "contained"]
     for kind, make in RIGS.items():
         refused = named = plain = out = 0
         inside: list[bool] = []
@@ -175,7 +167,7 @@ def rightly(text: str, seen: Observations, second: set[int]) -> float:
 
 
 @section("ordinary.md", "two cameras", seeds=range(1), views=8, simulated_only=True)
-def of_captures(seeds: range = range(4), views: int = 20, simulated_only: bool = False) -> Iterator[str]:
+def of_captures(seeds: range = range(4), views: int = 20, simulated_only: bool = False) -> Lines:
     found: dict[str, list[float | None]] = {}
     for kind, seen, second in itertools.chain(captures(seeds, views), () if simulated_only else real_captures()):
         share: float | None = None
@@ -184,9 +176,8 @@ def of_captures(seeds: range = range(4), views: int = 20, simulated_only: bool =
         except KcalError as error:
             share = rightly(str(error), seen, second)
         found.setdefault(kind, []).append(share)
-    rows = []
+    yield ["captures", "refused", "rightly named"]
     for kind, shares in found.items():
         told = [share for share in shares if share is not None]
         mean = f"{sum(told) / len(told):.2f}" if told and "good" not in kind else "–"
-        rows.append([kind, f"{len(told)}/{len(shares)}", mean])
-    return table(["captures", "refused", "rightly named"], rows)
+        yield [kind, f"{len(told)}/{len(shares)}", mean]

@@ -27,8 +27,9 @@ from typing import NamedTuple
 
 import psutil
 
+from scripts.shared.children import ALONE
 from scripts.shared.memory import peak_megabytes
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 from scripts.shared.small_photographs import COLUMNS, HEIGHT, ROWS, WIDTH, photographs
 from scripts.shared.timing import children_seconds
@@ -70,7 +71,7 @@ class Cluster:
     def _start(self, kind: str, *options: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", *options, "--host", "127.0.0.1",
                    "--no-dashboard", "--scheduler-file", str(self._where)]  # fmt: skip
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=_environment())
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | ALONE)
 
     @property
     def address(self) -> str:
@@ -114,10 +115,6 @@ def _works(process: psutil.Process) -> bool:
     return False
 
 
-def _environment() -> dict[str, str]:
-    return os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-
-
 @contextlib.contextmanager
 def cluster(folder: Path, workers: int) -> Iterator[Cluster]:
     started = Cluster(folder, workers)
@@ -138,7 +135,7 @@ def batch(
     before, peaks, kills = children_seconds(), defaultdict[str, float](float), 0
     next_kill = pieces_kept(output) + every
     with tempfile.TemporaryFile("w+") as said:
-        running = subprocess.Popen(command, stdout=said, stderr=said, env=_environment())
+        running = subprocess.Popen(command, stdout=said, stderr=said, env=os.environ | ALONE)
         while running.poll() is None:
             time.sleep(0.2)
             _note_peaks(peaks, running.pid, on)
@@ -208,7 +205,7 @@ def missing_or_twice(output: Path, names: list[str]) -> int:
 def fleet(
     cameras: int = 1000, views: int = 6, every: int = 100, workers: int = 2, model: str = "opencv5",
     refine: str = "saddle",
-) -> Iterator[str]:  # fmt: skip
+) -> Lines:  # fmt: skip
     """A worker is killed after every so many pieces of work."""
     rows, failed = [], False
     with tempfile.TemporaryDirectory(prefix="kcal-fleet-") as name:
@@ -246,13 +243,9 @@ def fleet(
         with cluster(folder, workers) as dask:
             second = batch(source, folder / "resumed", *options, on=dask, every=every)
         add(
-            "Dask, also its scheduler, then continued",
-            folder / "resumed",
-            [first, second],
-            children_seconds() - before,
+            "Dask, also its scheduler, then continued", folder / "resumed", [first, second], children_seconds() - before
         )
-    yield from table(HEAD, rows)
-    yield ""
+    yield from [HEAD, *rows]
     yield (
         f"{cameras:,} cameras of {views} images of {WIDTH} x {HEIGHT}, {model}, {workers} workers of one thread, "
         f"a kill after every {every} pieces of work."

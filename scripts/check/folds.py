@@ -28,7 +28,7 @@ from kcal.lens.model import distort_components
 from kcal.lens.projection import from_pixels
 from kcal.lens.region import DIRECTIONS, Region, direction_limits, in_region, sampled_region, valid_region
 from scripts.check.uncertainty import LENS
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 from scripts.shared.real_captures import stereo_images
 from scripts.shared.sections import section
 from scripts.shared.wide_lens import load
@@ -237,7 +237,7 @@ def calibrated() -> list[Camera]:
     ]
 
 
-def ordinary_lenses(count: int, seed: int) -> Iterator[str]:
+def ordinary_lenses(count: int, seed: int) -> Lines:
     """Valid pixels that ordinary cameras lose by the proof."""
     generator = np.random.default_rng(seed)
     groups: dict[str, tuple[list[Camera], int]] = {
@@ -251,18 +251,17 @@ def ordinary_lenses(count: int, seed: int) -> Iterator[str]:
         ),
         "drawn at random": ([mild(generator) for _ in range(count)], 8),
     }
-    rows = []
+    yield ["cameras", "number", "that fold inside the image", "valid pixels", "lost"]
     for name, (cameras, step) in groups.items():
         counts = [lost_pixels(camera, step) for camera in cameras]
         folding = sum(not bool(camera.covers_image()) for camera in cameras)
-        rows.append([name, len(cameras), folding, sum(all_ for all_, _ in counts), sum(lost for _, lost in counts)])
-    return table(["cameras", "number", "that fold inside the image", "valid pixels", "lost"], rows)
+        yield [name, len(cameras), folding, sum(all_ for all_, _ in counts), sum(lost for _, lost in counts)]
 
 
 @section("lens.md", "folds", lenses=3, compared=1, ordinary=0)
 def folds(
     lenses: int = 10_000, compared: int = 1000, minutes: float = math.inf, ordinary: int = 400, seed: int = 0
-) -> Iterator[str]:
+) -> Lines:
     yield from constructed(lenses, seed, compared, minutes)
     if ordinary:
         yield ""

@@ -15,13 +15,14 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from scripts.shared.page import DOCS, table
+from scripts import make_sbom
+from scripts.shared.page import DOCS, Line, Lines, table
 from scripts.shared.sections import section
 from scripts.shared.timing import children_seconds
 
@@ -51,22 +52,12 @@ print(json.dumps([cv2.__version__, [detect_board(read_gray(path), board).pixels.
 """
 
 
-def needed(requirements: Iterable[str], extra: str = "") -> set[str]:
+def needed(requirements: Iterable[str]) -> set[str]:
     """Names of the packages that these need, with all that those need in turn."""
-    names: set[str] = set()
-    waiting = [(Requirement(text), extra) for text in requirements]
-    while waiting:
-        requirement, given = waiting.pop()
-        name = canonicalize_name(requirement.name)
-        if name in names or (requirement.marker and not requirement.marker.evaluate({"extra": given})):
-            continue
-        try:
-            told = importlib.metadata.requires(name) or []
-        except importlib.metadata.PackageNotFoundError:
-            raise SystemExit(f"{name} is not installed here; pip install -e '.[dev]'") from None
-        names.add(name)
-        waiting += [(Requirement(text), one) for text in told for one in requirement.extras or {""}]
-    return names
+    try:
+        return set(make_sbom.needed(map(Requirement, requirements)))
+    except importlib.metadata.PackageNotFoundError as missing:
+        raise SystemExit(f"{missing.name} is not installed here; pip install -e '.[dev]'") from None
 
 
 def megabytes(packages: Iterable[str]) -> float:
@@ -88,7 +79,7 @@ def seconds(words: list[str], path: str, runs: int) -> float:
 
 
 @section("other-programs.md", "extras", runs=1)
-def extras(runs: int = 9) -> list[str]:
+def extras(runs: int = 9) -> list[Line]:
     """Size of each extra, and CPU seconds to start with all of them and with none."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     base = needed(project["dependencies"])
@@ -109,7 +100,7 @@ def extras(runs: int = 9) -> list[str]:
         for said, words in _STARTS.items():
             times = [seconds(words, path, runs) for path in (str(ROOT), f"{folder}{os.pathsep}{ROOT}")]
             starts.append([said, *(f"{one:.2f}" for one in times)])
-    return [*lines, "", *table(["start", "with all extras, CPU s", "without"], starts)]
+    return [*lines, ["start", "with all extras, CPU s", "without"], *starts]
 
 
 @section("other-programs.md", "opencv packages", packages=("opencv-python-headless==5.0.0.93",), images=1)
@@ -121,7 +112,7 @@ def opencv_packages(
         "opencv-python==4.12.0.88",
     ),
     images: int = 13,
-) -> Iterator[str]:
+) -> Lines:
     """Corners of OpenCV's sample images with other packages of OpenCV, against those with kcal's own."""
     if "KCAL_DATA" not in os.environ:
         raise SystemExit("KCAL_DATA names no folder of captures")
@@ -138,7 +129,8 @@ def opencv_packages(
             raise SystemExit(done.stderr[-1000:])
         return json.loads(done.stdout)
 
-    (_, own), rows = corners(str(ROOT)), []
+    yield ["package", "version", "corners", "largest difference, px"]
+    _, own = corners(str(ROOT))
     for package in packages:
         with tempfile.TemporaryDirectory() as folder:
             subprocess.run(
@@ -149,5 +141,4 @@ def opencv_packages(
             assert package.partition("==")[2].startswith(used), used
         far = max(abs(a - b) for one, other in zip(own, found, strict=True) for p, q in zip(one, other, strict=True)
                   for a, b in zip(p, q, strict=True))  # fmt: skip
-        rows.append([*package.split("=="), sum(map(len, found)), f"{far:.1g}"])
-    return table(["package", "version", "corners", "largest difference, px"], rows)
+        yield [*package.split("=="), sum(map(len, found)), f"{far:.1g}"]

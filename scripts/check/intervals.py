@@ -15,14 +15,13 @@ import itertools
 import math
 import statistics
 import time
-from collections.abc import Iterator
 
 from kcal import CalibrationOptions, KcalError, calibrate_camera
 from kcal.calibrate.camera.trust import against_capture, interval_check, simulated_capture, simulated_refits
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.report.judge_camera import fault_of_views
 from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.simulated import figures, simulated
 
@@ -39,7 +38,7 @@ def judged(model: str, seed: int, refits: int) -> Record:
     try:
         result = calibrate_camera(case.seen, options)
         error = error_at_infinity(result.camera, case.lens)
-        truth = figures(result, case, error.pixels, error.errors)
+        truth = figures(result.camera, case.seen, error.pixels, error.errors)
         start = time.process_time()
         check = interval_check(result, AT, simulated_refits(result, options, AT, range(refits)))
         spent = time.process_time() - start
@@ -60,9 +59,13 @@ def judged(model: str, seed: int, refits: int) -> Record:
     }
 
 
-def lines(records: list[Record]) -> Iterator[str]:
+def lines(records: list[Record]) -> Lines:
     """One row for each lens model."""
-    rows = []
+    yield [
+        "lens", "calibrations", "truly true", "truth inside, of the image", "refits inside", "refits say true",
+        "views say true", "second capture says true", "check agrees", "check with --against agrees",
+        "CPU s, 100 refits",
+    ]  # fmt: skip
     for model in MODELS:
         some = [one for one in records if one["key"][0] == model and "refused" not in one]
         if not some:
@@ -71,7 +74,7 @@ def lines(records: list[Record]) -> Iterator[str]:
         alone = [one["true"] and one["fault"] is None for one in some]
         both = [ok and one["same"] for ok, one in zip(alone, some, strict=True)]
         agree = [sum(a == b for a, b in zip(said, true, strict=True)) for said in (alone, both)]
-        rows.append([
+        yield [
             "default" if model == MODELS[0] else model,
             len(some),
             sum(true),
@@ -83,19 +86,13 @@ def lines(records: list[Record]) -> Iterator[str]:
             f"{agree[0]} of {len(some)}",
             f"{agree[1]} of {len(some)}",
             f"{statistics.median(one['cpu_s'] / one['key'][2] for one in some) * 100:.0f}",
-        ])  # fmt: skip
-    heads = (
-        "lens", "calibrations", "truly true", "truth inside, of the image", "refits inside", "refits say true",
-        "views say true", "second capture says true", "check agrees", "check with --against agrees",
-        "CPU s, 100 refits",
-    )  # fmt: skip
-    return table(heads, rows)
+        ]  # fmt: skip
 
 
 @section("ordinary.md", "warm refits", count=1, seeds=range(1))
-def cold_and_warm(count: int = 8, seeds: range = range(4)) -> Iterator[str]:
+def cold_and_warm(count: int = 8, seeds: range = range(4)) -> Lines:
     """How far refits that begin at the found camera end from those that begin with nothing."""
-    rows = []
+    yield ["capture", "refits", "apart, σ (median)", "(largest)", "CPU s warm", "CPU s cold"]
     options = CalibrationOptions()
     for seed in [(0, 1, 5, 6)[i] for i in seeds]:
         views, by_hand = VIEWS[seed // 2 % len(VIEWS)], bool(seed % 2)
@@ -113,12 +110,10 @@ def cold_and_warm(count: int = 8, seeds: range = range(4)) -> Iterator[str]:
                 float((pixel_errors(cameras[0], cameras[1], places).square().sum(-1) / sigma).nanmean().sqrt())
             )
         kind = f"{views} views {'by hand' if by_hand else 'on a stand'}"
-        rows.append([kind, count, f"{statistics.median(apart):.3f}", f"{max(apart):.3f}",
-                     *(f"{spent / count:.2f}" for spent in took)])  # fmt: skip
-    heads = ("capture", "refits", "apart, σ (median)", "(largest)", "CPU s warm", "CPU s cold")
-    return table(heads, rows)
+        yield [kind, count, f"{statistics.median(apart):.3f}", f"{max(apart):.3f}",
+               *(f"{spent / count:.2f}" for spent in took)]  # fmt: skip
 
 
 @section("ordinary.md", "intervals", seeds=range(1), refits=2)
-def intervals(kept: Kept = NOT_KEPT, seeds: range = range(20), refits: int = 100) -> Iterator[str]:
+def intervals(kept: Kept = NOT_KEPT, seeds: range = range(20), refits: int = 100) -> Lines:
     return lines(kept.records(itertools.product(MODELS, seeds, [refits]), judged))

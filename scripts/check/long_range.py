@@ -26,7 +26,7 @@ from kcal.lens.pose import side_axes
 from kcal.locate.stereo import sight_lines
 from kcal.rig import read_features
 from kcal.scene.common_errors import line_errors
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import section
 
@@ -255,15 +255,15 @@ def kept_matches() -> tuple[Rig, Tensor, Tensor]:
 
 
 @section("long-range.md", "noise")
-def noise() -> Iterator[str]:
-    rows, (_, _, results) = [], scene()
+def noise() -> Lines:
+    yield ["stated noise", "left out", "χ² / freedom", "pitch", "yaw", "roll"]
+    _, _, results = scene()
     for sigma, found in results.items():
         turn = turned(found.stereo().right_from_left_rotation, results[0.3].stereo().right_from_left_rotation)
         sigmas = (DEGREE * found.sigma_rotation).tolist()
         cells = [f"{value:+z.4f} ± {own:.4f}°" for value, own in zip(turn, sigmas, strict=True)]
         left_out = ", ".join(item.name for item in found.left_out)
-        rows.append([f"{sigma} px", left_out, f"{found.chi2 / found.freedom:.2f}", *cells])
-    return table(["stated noise", "left out", "χ² / freedom", "pitch", "yaw", "roll"], rows)
+        yield [f"{sigma} px", left_out, f"{found.chi2 / found.freedom:.2f}", *cells]
 
 
 @section("long-range.md", "halves-all")
@@ -279,9 +279,10 @@ def halves_of_kept() -> Iterator[str]:
 
 
 @section("long-range.md", "lenses", lenses=("all views",))
-def lenses(lenses: tuple[str, ...] = ("all views", "first half", "second half", "opencv8")) -> Iterator[str]:
+def lenses(lenses: tuple[str, ...] = ("all views", "first half", "second half", "opencv8")) -> Lines:
     rig, every, out = kept_matches()
-    base, rows = refitted(rig, every[~out]), []
+    yield ["lens from", "RMS of corners, px", "matches off, px", "pitch", "yaw", "roll"]
+    base = refitted(rig, every[~out])
     for name in lenses:
         other = lens(scene()[0], name, "opencv8" if name == "opencv8" else None)
         pose = rig.right_from_left_rotation, rig.right_from_left_translation
@@ -289,20 +290,19 @@ def lenses(lenses: tuple[str, ...] = ("all views", "first half", "second half", 
         turn = turned(own.right_from_left_rotation, base.right_from_left_rotation)
         record = other.calibration.record if other.calibration else None
         rms = "" if record is None else f"{record.rms:.2f}"
-        rows.append([name, rms, f"{fitted(own, every[~out]).sigma:.3f}", *(f"{value:+z.4f}°" for value in turn)])
-    return table(["lens from", "RMS of corners, px", "matches off, px", "pitch", "yaw", "roll"], rows)
+        yield [name, rms, f"{fitted(own, every[~out]).sigma:.3f}", *(f"{value:+z.4f}°" for value in turn)]
 
 
 @section("long-range.md", "change")
-def changes(sizes: tuple[float, ...] = (0.0, 1.0, 3.0, 10.0)) -> Iterator[str]:
+def changes(sizes: tuple[float, ...] = (0.0, 1.0, 3.0, 10.0)) -> Lines:
     _, features, results = scene()
-    first, rows = results[0.15].stereo(), []
+    yield ["change of the lens, at the corner", "of the distance from the middle", "yaw"]
+    first = results[0.15].stereo()
     for size in sizes:
         found = solved(features, lens(scene()[0], "all views"), 0.15, size)
         yaw = turned(found.stereo().right_from_left_rotation, first.right_from_left_rotation)[1]
         share = 100.0 * size / (0.5 * math.hypot(*first.left.size))
-        rows.append([f"{size:g} px", f"{share:.3f} %", f"{yaw:+z.4f} ± {DEGREE * float(found.sigma_rotation[1]):.4f}°"])
-    return table(["change of the lens, at the corner", "of the distance from the middle", "yaw"], rows)
+        yield [f"{size:g} px", f"{share:.3f} %", f"{yaw:+z.4f} ± {DEGREE * float(found.sigma_rotation[1]):.4f}°"]
 
 
 @section("long-range.md", "causes")

@@ -21,27 +21,221 @@ cosmic-ray (a new process and the whole suite for each mistake) draws samples or
 from __future__ import annotations
 
 import ast
+import contextlib
 import hashlib
 import importlib.machinery
 import inspect
 import json
 import math
+import os
 import pkgutil
+import resource
+import signal
 import sys
+import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, NamedTuple
 
+import coverage
 import pytest
 
-from scripts.check.harmless import HARMLESS
 from scripts.check.mutations import Site, sites
-from scripts.check.traced_tests import FILE, ROOT, First, apart, observed, run_tests
-from scripts.shared.page import read_section, table
+from scripts.shared.children import children
+from scripts.shared.page import Line, Lines, laid_out, read_section
 from scripts.shared.sections import section
 from scripts.shared.timing import show
+
+HARMLESS = {
+    "cc931d9fd18dd576": "`repr` or `compare` of a field that follows from the others",
+    "b0297d28c7fdb75f": "how finely a start of Newton's method is tabulated",
+    "1861c5cc51a9507f": "a cell is cut in unequal parts that still cover it: the proof takes longer",
+    "c1c0d87e7ed882a1": "a number that stands where it is not read",
+    "b65b2b83af420b66": "cells without spaces are stripped: only time",
+    "b32215be7946701c": "zero times a number, added or subtracted",
+    "4beb85845d5b49a6": "a number that is set again before it is read",
+    "ffa3e8654c336e29": "a row of nodes more, beyond the image",
+    "7900d21ef92672db": "a number that stands where it is not read",
+    "2166b957298e0a07": "how coordinates lie in memory: only time",
+    "76620474b9ce23e3": "by what a covariance is divided where a variance is zero: how much rounding is let through",
+    "4ba3346cb1ac1a53": "rounds more than are needed where pixels are not square",
+    "901479ab88fb1d4e": "where a search of amplitudes begins",
+    "24324b097f27a6bd": "the rows without one more, of which the pupil's are none",
+    "622e793a3790f775": "fy for fx of a camera with square pixels",
+    "eb5d59136d2feaa9": "where a thing stands on a site that is made up",
+    "3fd88ae2dcad7243": "compares no elements at all",
+    "5ffe52c4f8d4ca51": "random numbers that nothing reads: other draws of the same kind",
+    "3bfb151f959b9181": "where a thing stands on a site that is made up",
+    "cdd6206bf027eb13": "how finely the truth is tabulated",
+    "de053044b2589680": "when stopped elements are dropped from a batch: only time",
+    "e0ea7adc7be67053": "how many steps a search may take that ends long before",
+    "919fd48b3143c8b7": "a number, from the same factors in another order",
+    "0596630b21cb4ec2": "a number, from the same factors in another order",
+    "ab8b1729821ccfe0": "a first focal length, from which a fit begins",
+    "02a20fa8d7b5185d": "where a thing stands on a site that is made up",
+    "96a90b97a1771eed": "a variance that is zero to the last bit",
+    "921b63f435eb9d99": "whether two texts are equal, whichever comes first",
+    "3b10bbfa613c0d36": "lines of a log below the level that is shown",
+    "ed7dec0d6447abef": "when stopped elements are dropped from a batch: only time",
+    "e7fec4571310adb3": "what happens when no port is free, and there always is one",
+    "9d350f625c8848c9": "a negative number, which means none whatever its size",
+    "00831ec1d5c8d5b9": "a factor of three in limits of rounding",
+    "687fb8c6ef964857": "when stopped elements are dropped from a batch: only time",
+    "70f90a90996024bd": "zero, or the cube of zero",
+    "4c0100bb1d58a305": "which focal lengths below a millionth of a pixel are refused",
+    "3082889367ad8c91": "which way the two axes across the baseline point",
+    "6c6214b58c56f43b": "pixels of which one coordinate is NaN: no lens has a ray for them either",
+    "5de44679f2cc6387": "rays that have length one",
+    "868ad6314f05f253": "the angle between two rays, whichever comes first",
+    "4f7ded21d6d6f9ec": "a first principal point, from which a fit begins",
+    "43745dfb24530793": "a share that equals a limit to the last bit",
+    "41ec4fe6054bc787": "how many matches are worked on at a time: only memory",
+    "47e93b395d9a2442": "the size of letters",
+    "d3166586025778b5": "the size of letters",
+    "991f7ae90849076e": "a circle, drawn from another of its points on",
+    "de07024734379c68": "by how many points a name stands beside its mark",
+    "2d9fdadb75d7d0e3": "the size of letters",
+    "1e51aa8f523d671c": "whether nothing is searched for what is missing of one camera alone, of which nothing is kept",
+    "5e0d5c9b92387eca": "the third best of all, which nothing reads",
+    "9c9b58ae1e5c2c2a": "numbers of cells, of which no two are alike in either way",
+    "f4b30131556f65a1": "the determinant of a product, in either order",
+    "fd451fa74fc52ba2": "whether all of two axes are finite, whichever comes first",
+    "839c16b3f3d8599d": "what is taken where no angle is wide enough, and the widest one always is",
+    "a163b7a5790def1c": "where a search of amplitudes begins",
+    "de5f75858fc5244d": "how far away things are put that are as good as infinitely far",
+}
+
+
+ROOT = Path(__file__).parents[2]
+# Seconds of the clock for each of processor time: on a busy machine.
+CLOCK = 100.0
+MEMORY = 6 << 30
+# Seconds of processor time after which the rest of a file of tests does not count.
+FILE = 8.0
+
+
+def apart(work: Callable[..., object], *arguments: object, seconds: float, loaded: Sequence[str]) -> Any:
+    """What `work` returns in a process of its own, or "too slow" or "crash"; seconds of processor time.
+
+    The process begins with the modules of `loaded`.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        answer = Path(folder, "answer.json")
+        child = children(*loaded).Process(target=_write_answer, args=(answer, seconds, work, *arguments))
+        child.start()
+        child.join(CLOCK * seconds)
+        late, code = child.exitcode is None, child.exitcode
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child.pid or 0, signal.SIGKILL)
+        child.join()
+        if answer.exists():
+            return json.loads(answer.read_text())
+        return "too slow" if late or code == -signal.SIGXCPU else "crash"
+
+
+def _write_answer(answer: Path, seconds: float, work: Callable[..., object], *arguments: object) -> None:
+    os.setpgid(0, 0)
+    used = math.ceil(time.process_time() + seconds)
+    resource.setrlimit(resource.RLIMIT_CPU, (used, used + 5))
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    silence = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(silence, stream)
+    with contextlib.suppress(BaseException):
+        answer.write_text(json.dumps(work(*arguments)))
+    os._exit(0)
+
+
+class Executed:
+    """Plugin of pytest: which tests execute a line of kcal, and their processor time.
+
+    What fixtures of more than one test execute counts for all tests of the file.
+    """
+
+    def __init__(self) -> None:
+        self.coverage = coverage.Coverage(data_file=None, include=[f"{ROOT}/kcal/*"], config_file=False)
+        self.seconds: dict[str, float] = {}
+        self.failed: set[str] = set()
+        self.unseen: list[str] = []
+        self.end = time.process_time() + FILE
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        """Name the test that executes what follows, and time it."""
+        self.coverage.switch_context(item.nodeid)
+        begin = time.process_time()
+        yield
+        self.seconds[item.nodeid] = round(time.process_time() - begin, 2)
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_setup(self, item: pytest.Item) -> None:
+        """Leave out the rest of a file that takes too long, and what needs a browser, whose time is not counted."""
+        browser = any("Chromium" in mark.kwargs.get("reason", "") for mark in item.iter_markers("skipif"))
+        if browser:
+            pytest.skip("browser")
+        if time.process_time() > self.end:
+            self.unseen.append(item.nodeid)
+            pytest.skip("too long")
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any, request: Any) -> Iterator[None]:
+        """Let no test own what a shared fixture executes."""
+        if fixturedef.scope != "function":
+            self.coverage.switch_context("*")
+        yield
+        if fixturedef.scope != "function" and "::" in (name := os.environ["PYTEST_CURRENT_TEST"]):
+            self.coverage.switch_context(name.rsplit(" ", 1)[0])
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note which tests pass."""
+        if report.outcome != "passed":
+            self.failed.add(report.nodeid)
+
+    def executed(self) -> dict[str, dict[int, list[str]]]:
+        """Tests by path and line; "*" for all."""
+        data = self.coverage.get_data()
+        return {
+            str(Path(path).relative_to(ROOT)): {
+                # What a file of tests executes when it is imported counts for all of its tests.
+                line: [name or "*" for name in names]
+                for line, names in data.contexts_by_lineno(path).items()
+            }
+            for path in data.measured_files()
+        }
+
+
+class First:
+    """Plugin of pytest: the test that noticed."""
+
+    name = ""
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note a test that fails."""
+        if report.failed and not self.name:
+            self.name = report.nodeid
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        """Note a file that cannot be imported."""
+        if report.failed and not self.name:
+            self.name = f"import of {report.nodeid}"
+
+
+def run_tests(arguments: list[str], plugin: object) -> int:
+    os.chdir(ROOT)
+    options = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--no-header", "--tb=no", "--assert=plain"]
+    return int(pytest.main([*options, "-m", "not slow", *arguments], plugins=[plugin]))
+
+
+def observed(file: str) -> dict:
+    """The tests of one file."""
+    lines = Executed()
+    lines.coverage.start()
+    run_tests([file], lines)
+    lines.coverage.stop()
+    return {"seconds": lines.seconds, "failed": sorted(lines.failed), "unseen": lines.unseen, "lines": lines.executed()}
+
 
 STATE = ROOT / ".mutants"
 # The modules at the top, beside the rooms.
@@ -248,7 +442,7 @@ def first_draw(by_seed: dict[int, Draw], row: tuple[str, ...] | None) -> str:
     return by_seed[min(by_seed)].share if len(by_seed) > 1 else ""
 
 
-def report() -> tuple[list[str], list[str]]:
+def report() -> tuple[list[Line], list[Line]]:
     """A table of the rooms, the first and the last draw of each; and what was not noticed, or is harmless, by line."""
     kept, at_first, known = results(), results(first=True), rows_of_page()
     rows: list[tuple[object, ...]] = []
@@ -294,30 +488,28 @@ def report() -> tuple[list[str], list[str]]:
     )
     heads = ("room", "first draw", "last draw: seed", "drawn", "harmless", "noticed")
     lines = [
-        f"Not noticed ({len(missed)})", "",
-        *table(("line", "seed", "kind", "before", "after", "tests", "key"), missed), "",
-        f"Harmless ({len(idle)})", "", *table(("line", "seed", "kind", "before", "after", "why"), idle),
+        f"Not noticed ({len(missed)})", ("line", "seed", "kind", "before", "after", "tests", "key"), *missed,
+        f"Harmless ({len(idle)})", ("line", "seed", "kind", "before", "after", "why"), *idle,
     ]  # fmt: skip
-    return [*table(heads, rows), "", summary], lines
+    return [heads, *rows, summary], lines
 
 
-def time_table(rooms: Sequence[str]) -> Iterator[str]:
+def time_table(rooms: Sequence[str]) -> Lines:
     """Processor time of each room's tests, and the tests that take longest."""
-    rows = []
+    yield ["room", "tests", "CPU s", "those of 2 s and more"]
     for room in rooms:
         tests = sorted(((s, name) for file in observe(room, -math.inf) for name, s in file["seconds"].items()))[::-1]
         longest = ", ".join(f"{name.split('/')[-1]} {seconds:.0f}" for seconds, name in tests[:6] if seconds >= 2)
-        rows.append((f"`{room}`", len(tests), f"{sum(seconds for seconds, _ in tests):.0f}", longest))
-    return table(("room", "tests", "CPU s", "those of 2 s and more"), rows)
+        yield (f"`{room}`", len(tests), f"{sum(seconds for seconds, _ in tests):.0f}", longest)
 
 
 @section("mutants.md", "mutants", seconds=0.0, rooms=("web",))
 def mutants(
     rooms: tuple[str, ...] = ROOMS, sample: int = 8, seed: int = 1, seconds: float = math.inf, budget: float = 30.0,
     again: bool = False, times: bool = False,
-) -> list[str]:  # fmt: skip
+) -> list[Line]:  # fmt: skip
     if times:
-        show(list(time_table(rooms)))
+        show(list(laid_out(time_table(rooms))))
         return []
     STATE.mkdir(exist_ok=True)
     stop = time.monotonic() + seconds
@@ -332,5 +524,5 @@ def mutants(
             if site.key not in HARMLESS and (site.key not in kept or repeat):
                 judge(files, path, number, site, budget, seed)
     found, lines = report()
-    show(lines)
+    show(list(laid_out(lines)))
     return found

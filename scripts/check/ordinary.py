@@ -16,7 +16,7 @@ import math
 import statistics
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -26,10 +26,9 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.lens import camera_difference
 from kcal.report import camera_verdict
 from scripts.shared.children import interpreter
-from scripts.shared.held_out import Projection, held_out
-from scripts.shared.mrcal_camera import splined_camera
+from scripts.shared.held_out import Projection, of_halves
 from scripts.shared.page import table
-from scripts.shared.peer_lenses import END, fisheye, opencv
+from scripts.shared.peer_lenses import END, fisheye, opencv, splined_camera
 from scripts.shared.real_captures import RealCapture, load, names
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 
@@ -51,12 +50,12 @@ def judged(name: str) -> Record:
     if interpreter("mrcal"):
         fitters["mrcal"] = lambda half: splined_camera(half.seen, half.weight)
     if kcal is not None:
-        record["held"]["kcal"] = _held_out(kcal, halves)
+        record["held"]["kcal"] = of_halves(kcal, halves)
         between = camera_difference(kcal[0], kcal[1])
         record |= {"ratio": between.ratio, "p": between.probability, "shift": between.rms}
     for model, fit in fitters.items():
         try:
-            record["held"][model] = _held_out([fit(half) for half in halves], halves)
+            record["held"][model] = of_halves([fit(half) for half in halves], halves)
         except (KcalError, cv2.error, subprocess.SubprocessError) as error:
             record["held"][model] = {"failed": str(error)[-300:]}
     return record
@@ -93,17 +92,6 @@ def _defaults(halves: tuple[RealCapture, RealCapture], record: Record) -> list[C
         record["noise"].append(result.noise)
         cameras.append(result.camera)
     return cameras if len(cameras) == len(halves) else None
-
-
-def _held_out(cameras: Sequence[Projection], halves: tuple[RealCapture, RealCapture]) -> Record:
-    """RMS of each half's camera on the other half, both together, and how many corners it has no image of."""
-    found = [
-        held_out(camera, half.seen.board.points, half.seen.pixels(), half.weight)
-        for camera, half in zip(cameras, reversed(halves), strict=True)
-    ]
-    count, lost = sum(one.corners for one in found), sum(one.lost for one in found)
-    rms = {key: math.sqrt(sum(getattr(one, key) for one in found) / max(1, count - lost)) for key in ("still", "moved")}
-    return {**rms, "lost": lost, "corners": count}
 
 
 def over_best(record: Record) -> dict[str, float]:

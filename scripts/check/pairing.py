@@ -23,7 +23,7 @@ from kcal.rig import RigCovariance
 from kcal.track import Detections, ObjectDisparity
 from scripts.shared.marking_scene import Floats, background
 from scripts.shared.object_scene import Plate, exposed, paint_plate, plate, texture_gradient, true_box
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 from scripts.shared.sections import section
 from scripts.shared.timing import rms as rms_of
 
@@ -181,18 +181,16 @@ def drawn(frames: int, seed: int) -> tuple[dict[bool, list[Counts]], list[Pair]]
 
 
 @section("pairing.md", "association", frames=1)
-def association(frames: int = 20, seed: int = 0) -> Iterator[str]:
-    yield from [f"{frames} frames of {TARGETS} objects.", ""]
-    rows = []
+def association(frames: int = 20, seed: int = 0) -> Lines:
+    yield f"{frames} frames of {TARGETS} objects."
+    yield ["pairs by", "to be found", "precision", "recall", "precision of those not ambiguous", "ambiguous"]
     for looks, some in drawn(frames, seed)[0].items():
         total = Counts(*np.sum(some, axis=0).tolist())
-        rows.append([
+        yield [
             "geometry, size and looks" if looks else "geometry and size", total.there,
             f"{total.right / total.made:.1%}", f"{total.right / total.there:.1%}",
             f"{total.clear_right / total.clear:.1%}", f"{1 - total.clear / total.made:.1%}",
-        ])  # fmt: skip
-    heads = ["pairs by", "to be found", "precision", "recall", "precision of those not ambiguous", "ambiguous"]
-    yield from table(heads, rows)
+        ]  # fmt: skip
 
 
 @section("pairing.md", "disparity", frames=1)

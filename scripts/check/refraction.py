@@ -17,12 +17,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal import Landmarks, Localizer, RigData, RigOptions, solve_rig
+from kcal import Localizer, RigData, RigOptions, solve_rig
 from kcal.lens.pose import enu_from_cam
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA
 from kcal.locate.geodesy import mean_radius
 from kcal.rig import placed_rig
-from scripts.shared.long_range import ORIGIN, rig
+from scripts.shared.long_range import ORIGIN, landmarks_of, rig, with_noise
 from scripts.shared.page import table
 from scripts.shared.sections import section
 
@@ -68,22 +68,14 @@ def site(refraction: float, far: bool, generator: torch.Generator) -> Site:
 
 def heights(place: Site, generator: torch.Generator, noise: float) -> tuple[Tensor, Tensor, float]:
     """Errors (T,) of the targets' heights, their sigmas (T,), and the coefficient that was found."""
-
-    def normal(like: Tensor) -> Tensor:
-        return noise * torch.randn(like.shape, dtype=torch.float64, generator=generator)
-
-    landmarks = Landmarks(
-        names=tuple(map(str, range(COUNT))),
-        points=place.landmarks + SURVEY * normal(place.landmarks),
-        sigma=torch.full_like(place.landmarks, SURVEY),
-        pixels=place.landmark_marks + MARK * normal(place.landmark_marks),
-        pixel_sigma=MARK,
-    )
+    exact = landmarks_of(place.landmarks, place.landmark_marks, SURVEY, MARK)
+    noisy = with_noise(exact, generator)
     world = rig()
-    data = RigData(cameras=(world.left, world.right), names=("left", "right"), landmarks=landmarks)
+    data = RigData(cameras=(world.left, world.right), names=("left", "right"), landmarks=noisy if noise else exact)
     solved = solve_rig(data, RigOptions(intrinsics="fixed", refraction_sigma=REFRACTION_SIGMA))
     localize = Localizer(placed_rig(solved, ORIGIN), pixel_sigma=MARK)
-    marks = place.target_marks + MARK * normal(place.target_marks)
+    error = noise * torch.randn(place.target_marks.shape, dtype=torch.float64, generator=generator)
+    marks = place.target_marks + MARK * error
     found = localize(marks[:, 0], marks[:, 1])
     # Across the line of sight, upward: errors of the range are not those of light.
     sight = torch.nn.functional.normalize(place.targets, dim=-1)

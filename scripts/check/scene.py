@@ -5,6 +5,10 @@ ten pairs of a minute and of a day are rendered and matched; --scale makes the p
 px) and so affordable. `matches`: what is found under several conditions, beside OpenCV's SIFT and USAC. `common`:
 errors that matches share. `ranges`: places and covariances are those of one rendered pair, and errors are drawn anew
 for each seed. `speed`: CPU seconds of the adjustment.
+
+`repeats`: which errors of matches repeat, and what they do to yaw. Each seed is a terrain (960 x 540) of exact lenses.
+Keypoints are matched along the true epipolar lines of pictures with noise, and refined in these and in the same without
+noise: what then is left comes again in every pair of that light. Weights are those of noise and of 0.08 px.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ from typing import NamedTuple, TypeVar
 import cv2
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from torch import Tensor
 
 from kcal import Baseline, Features, Landmarks, RigData
@@ -35,16 +40,17 @@ from kcal.lens.pose import vector_from_rotation
 from kcal.lens.rig import Rig
 from kcal.locate.localizer import Localizer
 from kcal.scene.common_errors import line_errors, with_common_errors
-from kcal.scene.match import ImagePair, MatchedPair, counted, match_scene, scene_of, still_matches
+from kcal.scene.match import ImagePair, MatchedPair, counted, guided_matches, match_scene, scene_of, still_matches
 from kcal.scene.match import _posed as posed
+from kcal.scene.refine import refine_matches
 from kcal.sim.captures import TrueRig, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM
-from scripts.shared.long_range import ORIGIN, matches_of
-from scripts.shared.page import DOCS, table
+from scripts.shared.long_range import ORIGIN, landmarks_of, matches_of, with_noise
+from scripts.shared.page import DOCS, Lines, table
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.terrain import Terrain, Weather
-from scripts.shared.timing import share
+from scripts.shared.timing import rms, share
 from scripts.shared.traced import as_camera, capture
 
 TAPE = 0.005  # meters
@@ -150,24 +156,6 @@ def visible_keypoints(pair: ImagePair, moment: int, weather: Weather) -> int:
     return int((inside & same & ~moving).sum())
 
 
-@section("scene.md", "matches", conditions=("clear noon",))
-@torch.no_grad()
-def matches(conditions: tuple[str, ...] = tuple(CONDITIONS)) -> Iterator[str]:
-    """Matches under several conditions against the truth."""
-    heads = [
-        "condition",
-        "by",
-        "matches",
-        "wrong",
-        "off the line",
-        "of visible",
-        "RMS across, px",
-        "over its σ",
-        "CPU s",
-    ]
-    yield from table(heads, match_rows(conditions))
-
-
 def told(condition: str, by: str, found: Judged, seconds: float) -> list[object]:
     sigmas = "" if math.isnan(found.sigmas) else f"{found.sigmas:.2f}"
     return [
@@ -177,7 +165,11 @@ def told(condition: str, by: str, found: Judged, seconds: float) -> list[object]
     ]  # fmt: skip
 
 
-def match_rows(conditions: tuple[str, ...]) -> Iterator[list[object]]:
+@section("scene.md", "matches", conditions=("clear noon",))
+@torch.no_grad()
+def matches(conditions: tuple[str, ...] = tuple(CONDITIONS)) -> Lines:
+    """Matches under several conditions against the truth."""
+    yield ["condition", "by", "matches", "wrong", "off the line", "of visible", "RMS across, px", "over its σ", "CPU s"]
     for condition, weathers in ((name, CONDITIONS[name]) for name in conditions):
         # The first last: its pictures are then at hand.
         pairs = [photographed(SCENE, moment, weathers[moment - 1]) for moment in (3, 2, 1)][::-1]
@@ -321,7 +313,7 @@ BLOCK = 120.0  # px
 
 @section("scene.md", "common", moments=1)
 @torch.no_grad()
-def common(moments: int = 6) -> Iterator[str]:
+def common(moments: int = 6) -> Lines:
     """Whether means of errors over parts of the image are as large as stated, with and without what matches share.
 
     The scene stands still, and pairs differ by noise alone and by vehicles. Each part's weighted mean of
@@ -330,7 +322,7 @@ def common(moments: int = 6) -> Iterator[str]:
     terrain = Terrain(rig_of(HALF), 2)
     pairs = [photographed(terrain, moment) for moment in range(moments)]
     found = [match_scene(exact(HALF), pair) for pair in pairs]
-    rows = []
+    yield ["pairs", "parts of the image", "as independent: RMS over σ", "inside 95 %", "RMS over σ", "inside 95 %"]
     for count in [number for number in (1, 3, 6) if number <= moments]:
         z: tuple[list[float], list[float]] = [], []
         for first in range(0, moments + 1 - count, count):
@@ -353,10 +345,7 @@ def common(moments: int = 6) -> Iterator[str]:
         cells = [f"{count}", f"{len(z[0])}"]
         for values in map(np.array, z):
             cells += [f"{np.sqrt(np.square(values).mean()):.2f}", f"{100 * (np.abs(values) < 1.96).mean():.0f} %"]
-        rows.append(cells)
-    return table(
-        ("pairs", "parts of the image", "as independent: RMS over σ", "inside 95 %", "RMS over σ", "inside 95 %"), rows
-    )
+        yield cells
 
 
 def landmarks(draw: torch.Generator) -> Landmarks:
@@ -367,16 +356,10 @@ def landmarks(draw: torch.Generator) -> Landmarks:
     ray = torch.stack([1.0 * (share[:, 1] - 0.5), 0.4 * (share[:, 2] - 0.5), torch.ones_like(share[:, 0])], -1)
     points = distance * ray / ray.norm(dim=-1, keepdim=True)
     pixels, valid = RIG(points)
-    (left, right), valid = pixels.unbind(-2), valid.all(-1)
-    seen = (valid & RIG.left.inside(left) & RIG.right.inside(right)).nonzero()[:count, 0]
-    pixels = torch.stack([left, right], 1)[seen]
+    left, right = pixels.unbind(-2)
+    seen = (valid.all(-1) & RIG.left.inside(left) & RIG.right.inside(right)).nonzero()[:count, 0]
     enu = points[seen] @ torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]], dtype=torch.float64)
-    survey = 0.02 * torch.randn(count, 3, dtype=torch.float64, generator=draw)
-    marks = MARK * torch.randn(count, 2, 2, dtype=torch.float64, generator=draw)
-    return Landmarks(
-        names=tuple(f"post {i}" for i in range(count)), points=enu + survey, sigma=torch.full_like(survey, 0.02),
-        pixels=pixels + marks, pixel_sigma=MARK,
-    )  # fmt: skip
+    return with_noise(landmarks_of(enu, pixels[seen], 0.02, MARK), draw)
 
 
 def at_five_km(found: RigResult, draw: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -434,9 +417,8 @@ def speed(counts: tuple[int, ...] = (2000, 20_000)) -> Iterator[str]:
     for count in counts:
         draw = torch.Generator().manual_seed(1)
         share = torch.rand(6 * count, 3, dtype=torch.float64, generator=draw)
-        points = (
-            50.0 * 400.0 ** share[:, :1] * RIG.left.unproject(share[:, 1:] * (torch.tensor(RIG.left.size) - 1.0))[0]
-        )
+        rays, _ = RIG.left.unproject(share[:, 1:] * (torch.tensor(RIG.left.size) - 1.0))
+        points = 50.0 * 400.0 ** share[:, :1] * rays
         pixels, valid = RIG(points)
         (left, right), valid = pixels.unbind(-2), valid.all(-1)
         seen = (valid & RIG.left.inside(left) & RIG.right.inside(right)).nonzero()[:count, 0]
@@ -501,3 +483,82 @@ def ranges(kept: Kept = NOT_KEPT, seeds: range = range(30), corners: tuple[float
 
 def _brief(record: Record) -> str:
     return " ".join(f"{name} {np.mean(value['sigma']):.2g}" for name, value in record.items() if name != "key")
+
+
+KINDS = ("level ground", "hills and walls", "edges before something farther")
+BESIDE = 0.08  # px, added to the σ of each match in weights
+PATCH, DEEP = 21, 0.03  # px, and the logarithm of the depth's ratio in a patch from which there is an edge
+
+
+class Errors(NamedTuple):
+    """Matches (M,): kind, px across their lines with noise and without, σ, and degrees of yaw by those without."""
+
+    kind: Tensor
+    noisy: Tensor
+    clean: Tensor
+    sigma: Tensor
+    yaw: Tensor
+
+
+def kinds(terrain: Terrain, pixels: Tensor) -> Tensor:
+    """Kind (M,) of patches around pixels (M, 2) of the left image; -1: something moves there."""
+    picture = terrain.picture(0, 1, Weather())
+    depth = np.minimum(picture.depth, 1e6)
+    level = minimum_filter(picture.ground.astype(np.uint8), PATCH) > 0
+    deep = np.log(maximum_filter(depth, PATCH) / minimum_filter(depth, PATCH)) > DEEP
+    kind = np.where(level, 0, np.where(deep, 2, 1))
+    kind[maximum_filter(picture.moving, PATCH)] = -1
+    at = pixels.round().long()
+    return torch.from_numpy(kind)[at[:, 1], at[:, 0]]
+
+
+@torch.no_grad()
+def errors_of(seed: int) -> Errors:
+    """Of a terrain."""
+    rig, cameras = rig_of(HALF), exact(HALF)
+    true = Rig.pair(*cameras, rig.right_from_left_rotation, rig.right_from_left_translation)
+    terrain, weather = Terrain(rig, seed), Weather()
+    images = terrain.images(1, weather)
+    light = [gaussian_filter(terrain.picture(side, 1, weather).light, weather.blur) for side in (0, 1)]
+    points = keypoints(images[0], 8000), keypoints(images[1], 8000)
+    index = guided_matches(true, points)
+    left, right = (own.pixels[index[:, k]] for k, own in enumerate(points))
+    noisy, clean = (
+        refine_matches(true, (one, two), left, right)
+        for one, two in [[torch.from_numpy(part.astype(np.float32)) for part in each] for each in (images, light)]
+    )
+    truth, _ = terrain.true_right(left, 1)
+    near = [torch.linalg.vector_norm(found.right - truth, dim=-1) < WRONG for found in (noisy, clean)]
+    kind = kinds(terrain, left)
+    good = noisy.good & clean.good & near[0] & near[1] & (kind >= 0)
+    lines = [line_errors(true, torch.stack([left, found.right], 1)[good]) for found in (noisy, clean)]
+    sigma = lines[0].sigma(noisy.covariance[good])
+    weight = 1.0 / (sigma.square() + BESIDE**2) * (lines[1].off.abs() < 5.0 * BESIDE)
+    slopes = lines[1].slopes
+    variance = torch.linalg.inv(slopes.T @ (weight[:, None] * slopes))
+    yaw = (slopes @ variance[1]) * weight * lines[1].off
+    return Errors(kind[good], lines[0].off, lines[1].off, sigma, yaw.rad2deg())
+
+
+def rows(found: list[Errors]) -> list[list[str]]:
+    """Rows of the table."""
+    every = Errors(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+    rows = []
+    for number, name in enumerate((*KINDS, "all")):
+        own = (every.kind == number) | (number == len(KINDS))
+        turns = [float(one.yaw[(one.kind == number) | (number == len(KINDS))].sum()) for one in found]
+        error = torch.tensor(turns)
+        rows.append([
+            name, f"{int(own.sum()) / len(found):.0f}", f"{rms(every.noisy[own]):.3f}", f"{rms(every.sigma[own]):.3f}",
+            f"{rms(every.clean[own]):.3f}", f"{float(every.clean[own].abs().median()):.3f}", f"{rms(error):.5f}°",
+            f"{float(error.mean()):+.5f} ± {float(error.std()) / math.sqrt(len(found)):.5f}°",
+        ])  # fmt: skip
+    return rows
+
+
+HEADS = ("what", "matches", "RMS, px", "σ of noise", "of it repeats, RMS", "median", "yaw, RMS", "yaw, mean")
+
+
+@section("scene.md", "repeats", seeds=range(700, 701))
+def repeats(seeds: range = range(700, 712)) -> Iterator[str]:
+    return table(HEADS, rows([errors_of(seed) for seed in seeds]))

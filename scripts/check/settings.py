@@ -15,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ from kcal.lens import LensSetting
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.sim.raytrace import Misalignment, focal_length, system_matrix
 from kcal.sim.truth import TruthLens
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.peer_lenses import calibrated
 from scripts.shared.prescriptions import MACHINE_VISION
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
@@ -41,7 +40,15 @@ VIEWS, NOISE = 8, 0.1
 GAP, ZOOM = 3, 0.3
 # Distance that the sensor moves with focus, in that unit.
 FOCUS = 0.054
-WAYS = ("five", "three", "nearest", "opencv", "calibrated", "opencv there")
+# Ways to a camera, and what they are called.
+WAYS = {
+    "five": "interpolated from five",
+    "three": "interpolated from three",
+    "nearest": "nearest of five",
+    "opencv": "OpenCV-5, parameters linear",
+    "calibrated": "calibrated at its setting",
+    "opencv there": "OpenCV-5 at its setting",
+}
 
 
 def lens_at(kind: str, setting: float, seed: int) -> TruthLens:
@@ -145,42 +152,27 @@ def _root(draws: list[dict[str, Any]], way: str, what: str) -> float:
     return math.sqrt(np.mean([draw[way][what] for draw in draws]))
 
 
-def lines(records: list[Record], noises: int) -> Iterator[str]:
+def lines(records: list[Record], noises: int) -> Lines:
     """The table of the page."""
-    names = {
-        "five": "interpolated from five",
-        "three": "interpolated from three",
-        "nearest": "nearest of five",
-        "opencv": "OpenCV-5, parameters linear",
-        "calibrated": "calibrated at its setting",
-        "opencv there": "OpenCV-5 at its setting",
-    }
-    rows = []
+    yield ["", "camera", "error px, RMS", "σ px", "in 95 %", "σ of the curve px, median", "CPU s", "lenses x noises"]
     for kind in dict.fromkeys(record["key"][0] for record in records):
         own = [record for record in records if record["key"][0] == kind]
         draws = [draw for record in own for draw in record["draws"]]
-        for way, name in names.items():
+        for way, name in WAYS.items():
             stated = "inside" in draws[0][way]
             curve = "cpu" in draws[0][way]
-            rows.append(
-                [
-                    kind,
-                    name,
-                    f"{_root(draws, way, 'square'):.2f}",
-                    f"{_root(draws, way, 'variance'):.2f}" if stated else "–",
-                    f"{100 * np.mean([draw[way]['inside'] for draw in draws]):.1f} %" if stated else "–",
-                    f"{np.median([draw[way]['curve'] for draw in draws]):.3f}" if curve else "–",
-                    f"{np.median([draw[way]['cpu'] for draw in draws]):.1f}" if curve else "–",
-                    f"{len(own)} x {noises}",
-                ]
-            )
-    heads = ["", "camera", "error px, RMS", "σ px", "in 95 %", "σ of the curve px, median", "CPU s", "lenses x noises"]
-    return table(heads, rows)
+            yield [
+                kind, name, f"{_root(draws, way, 'square'):.2f}",
+                f"{_root(draws, way, 'variance'):.2f}" if stated else "–",
+                f"{100 * np.mean([draw[way]['inside'] for draw in draws]):.1f} %" if stated else "–",
+                f"{np.median([draw[way]['curve'] for draw in draws]):.3f}" if curve else "–",
+                f"{np.median([draw[way]['cpu'] for draw in draws]):.1f}" if curve else "–", f"{len(own)} x {noises}",
+            ]  # fmt: skip
 
 
 @section("settings.md", "settings", lenses=1, noises=1, kinds=("zoom",))
 def settings(
     kept: Kept = NOT_KEPT, kinds: tuple[str, ...] = ("zoom", "focus"), lenses: int = 10, noises: int = 3
-) -> Iterator[str]:
+) -> Lines:
     found = kept.records([(kind, seed, noises) for kind in kinds for seed in range(lenses)], work, shown)
     return lines([record for record in found if record["key"][2] == noises], noises)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,9 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from kcal.rig import RasterError, SkylineImage, skyline_attitude, skyline_source
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import NOT_KEPT, Kept, section
-from scripts.shared.skyline_trials import (
+from scripts.shared.skyline_scenes import (
     HERE,
     Ground,
     Site,
@@ -137,46 +136,41 @@ def _sigmas(result: RigResult, rows: torch.Tensor) -> Floats:
 
 
 @section("skyline.md", "alone", seeds=range(1), grounds=tuple(GROUNDS)[1:2])
-def told_alone(
-    kept: Kept = NOT_KEPT, seeds: range = range(30), grounds: tuple[str, ...] = tuple(GROUNDS)
-) -> Iterator[str]:
+def told_alone(kept: Kept = NOT_KEPT, seeds: range = range(30), grounds: tuple[str, ...] = tuple(GROUNDS)) -> Lines:
     work = functools.partial(alone, grounds=grounds)
     records = kept.records([("alone", seed) for seed in seeds], work, lambda _: "done")
-    heads = [
+    yield [
         "raster", "RMS error of heading / pitch / roll, °", "median σ", "error over σ", "truth in the 95 %",
         "of the heading's variance the raster's", "columns used", "refused", "CPU s",
     ]  # fmt: skip
-    rows = []
     for name in grounds:
         trials = [one[name] for one in records if one["key"][0] == "alone"]
         good = np.array([trial for trial in trials if not isinstance(trial, str)])
         error, sigma = good[:, :3], good[:, 3:6]
         ratio = error / sigma
-        rows.append([
+        yield [
             name, _three(np.sqrt((error**2).mean(0)), 4), _three(np.median(sigma, 0), 4),
             _three(np.sqrt((ratio**2).mean(0)), 2), _three(100 * (np.abs(ratio) < 1.96).mean(0), 0) + " %",
             f"{100 * good[:, 6].mean():.0f} %", f"{100 * good[:, 10].mean():.0f} %", len(trials) - len(good),
             f"{np.median(good[:, 9]):.1f}",
-        ])  # fmt: skip
-    return table(heads, rows)
+        ]  # fmt: skip
 
 
 @section("skyline.md", "rigs", seeds=range(1), views=8)
-def told_rigs(kept: Kept = NOT_KEPT, seeds: range = range(30), views: int = 30) -> Iterator[str]:
+def told_rigs(kept: Kept = NOT_KEPT, seeds: range = range(30), views: int = 30) -> Lines:
     records = kept.records([("rigs", seed, views) for seed in seeds], rigs, lambda _: "done")
-    heads = ["which way", "RMS error across / up, °", "RMS σ", "error over σ", "truth in the 95 %", "refused"]
-    degree, rows = math.degrees(1.0 / FOCAL), []
+    yield ["which way", "RMS error across / up, °", "RMS σ", "error over σ", "truth in the 95 %", "refused"]
+    degree = math.degrees(1.0 / FOCAL)
     for name in CASES:
         trials = [one[name] for one in records if one["key"][0] == "rigs"]
         good = np.array([trial for trial in trials if not isinstance(trial, str)]).reshape(-1, 2, 2, 3)
         error, sigma = good[:, 0].transpose(1, 0, 2).reshape(2, -1), good[:, 1].transpose(1, 0, 2).reshape(2, -1)
         ratio = error / sigma
-        rows.append([
+        yield [
             name, _three(degree * np.sqrt((error**2).mean(1)), 4), _three(degree * np.sqrt((sigma**2).mean(1)), 4),
             _three(np.sqrt((ratio**2).mean(1)), 2), _three(100 * (np.abs(ratio) < 1.96).mean(1), 0) + " %",
             len(trials) - len(good),
-        ])  # fmt: skip
-    return table(heads, rows)
+        ]  # fmt: skip
 
 
 def _three(values: Floats, digits: int) -> str:

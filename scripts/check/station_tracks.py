@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +25,7 @@ from kcal.lens.pose import enu_from_cam
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, geodetic_to_enu
 from kcal.pipeline.pairing import ObjectViews
 from kcal.track import AssociationOptions, ClockPrior, Detections, Motion, Tracker, TrackOptions, group_objects
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 from scripts.shared.station_scenes import ORIGIN, drawn_errors, marks, ring
 
@@ -200,26 +199,27 @@ def _judge_groups(views: ObjectViews, seen: list[Detections | None], owners: lis
 
 
 @section("tracks.md", "station tracks", seeds=range(1), seconds=12.0, counts=(2,))
-def station_tracks(
-    seeds: range = range(8), seconds: float = 60.0, counts: tuple[int, ...] = (2, 3, 5)
-) -> Iterator[str]:
+def station_tracks(seeds: range = range(8), seconds: float = 60.0, counts: tuple[int, ...] = (2, 3, 5)) -> Lines:
     yield (
         "12 targets (smokes, ships at 8 m/s, drones at 25 m/s) in 12 by 16 km, all of one category, once a second for "
         f"{seconds:g} s, {len(seeds)} draws; boxes {BOX_PX:g} px, {100 * MISSED:g} % missed, {FALSE:g} false an image; "
         f"attitude known to {ATTITUDE_DEG[0]}° and heading to {ATTITUDE_DEG[2]}°, clocks to {OFFSET_S} s and "
         f"{1e6 * RATE:g} ppm."
     )
-    yield ""
     all_sums = [Sums() for _ in counts]
     for seed, (count, each) in itertools.product(seeds, zip(counts, all_sums, strict=True)):
         run_seed(seed, count, seconds, each)
-    rows = []
+    yield [
+        "stations", "groups that are right", "marks of tracks that are right", "followed while two see it",
+        "breaks a target and hour", "ghosts among tracks", "inside 95 %; median of χ² over its own",
+        "clock at the end: RMS, inside 95 %", "CPU a moment",
+    ]  # fmt: skip
     for count, s in zip(counts, all_sums, strict=True):
         nees, clocks = np.array(s.nees), np.array(s.clocks).reshape(-1, 2)
         hours = s.followed / 3600.0
         rms, stated = (1e3 * np.sqrt((clocks[:, i] ** 2).mean()) for i in (0, 1))
         good = int((np.abs(clocks[:, 0]) < 1.96 * clocks[:, 1]).sum())
-        rows.append([
+        yield [
             count,
             f"{100 * s.right / max(s.groups, 1):.1f} % of {s.groups:,}; {s.doubtful:,} doubtful",
             f"{100 * s.well_given / max(s.given, 1):.1f} % of {s.given:,}",
@@ -229,14 +229,7 @@ def station_tracks(
             f"{100 * (nees < INSIDE_95).mean():.1f} % of {len(nees)}; {np.median(nees) / 2.366:.2f}",
             f"{rms:.0f} ms, stated {stated:.0f}; {good} of {len(clocks)}",
             f"{np.median(s.milliseconds):.0f} ms",
-        ])  # fmt: skip
-    heads = [
-        "stations", "groups that are right", "marks of tracks that are right", "followed while two see it",
-        "breaks a target and hour",
-        "ghosts among tracks",
-        "inside 95 %; median of χ² over its own", "clock at the end: RMS, inside 95 %", "CPU a moment",
-    ]  # fmt: skip
-    yield from table(heads, rows)
+        ]  # fmt: skip
 
 
 def crowd(targets: int, missed: float, false: int, seed: int) -> list[str]:
@@ -283,17 +276,17 @@ def crowd(targets: int, missed: float, false: int, seed: int) -> list[str]:
 
 
 @section("tracks.md", "station speed", targets=(10,))
-def speed(targets: tuple[int, ...] = (100, 1000)) -> Iterator[str]:
+def speed(targets: tuple[int, ...] = (100, 1000)) -> Lines:
     """Targets in 8 cameras: CPU of grouping and of tracking them, and how many groups are right."""
     yield (
         "Targets in 5 by 5 km, .8 km high, 8 cameras around them in 8 km; one thread, one draw of the cameras' "
         "errors. A group is right if all its marks are of one thing."
     )
-    yield ""
-    crowd(20, 0.0, 0, 0)
-    rows = [crowd(count, *rest, 0) for count in targets for rest in ((0.0, 0), (0.15, 0), (0.15, count // 30))]
-    heads = [
+    yield [
         "targets", "marks of them in 8 cameras", "CPU of grouping", "right groups", "wrong groups", "doubtful groups",
         "marks in groups that are not doubtful", "CPU of the tracker",
     ]  # fmt: skip
-    yield from table(heads, rows)
+    crowd(20, 0.0, 0, 0)
+    for count in targets:
+        for missed, false in ((0.0, 0), (0.15, 0), (0.15, count // 30)):
+            yield crowd(count, missed, false, 0)

@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from torch import Tensor
 from kcal import Camera, Localizer, Rig
 from kcal.locate.stereo import Localization, PositionStatus
 from kcal.locate.views import fit_views
-from scripts.shared.page import DOCS, table
+from scripts.shared.page import DOCS, Line, Lines
 from scripts.shared.real_captures import data_folder
 from scripts.shared.sections import section
 from scripts.shared.station_scenes import drawn_errors, marks, ring, targets
@@ -148,9 +148,9 @@ def peers_of(rig: Rig) -> dict[str, tuple[Solve, int]]:
 
 @section("stations.md", "peers", count=200)
 @torch.no_grad()
-def peers(count: int = 20_000) -> Iterator[str]:
+def peers(count: int = 20_000) -> Lines:
     """Table of errors and times."""
-    rows = []
+    yield ["views", "missing", "wrong", "program", "median mm", "95 % mm", "no position", "CPU s per million"]
     for views, missing, wrong in (
         (2, 0.0, 0.0), (4, 0.0, 0.0), (8, 0.0, 0.0), (4, 0.1, 0.05), (8, 0.0, 0.05), (8, 0.1, 0.05), (8, 0.4, 0.05),
     ):  # fmt: skip
@@ -170,19 +170,15 @@ def peers(count: int = 20_000) -> Iterator[str]:
             error = 1e3 * np.linalg.norm(result - cloud.numpy()[: len(some)], axis=1)
             none = ~np.isfinite(error)
             middle, high = np.quantile(error[~none], [0.5, 0.95])
-            rows.append(
-                [views, f"{missing:.0%}", f"{wrong:.0%}", name, f"{middle:.2f}", f"{high:.2f}", f"{none.mean():.1%}",
-                 f"{seconds:.1f}"]
-            )  # fmt: skip
-    heads = ["views", "missing", "wrong", "program", "median mm", "95 % mm", "no position", "CPU s per million"]
-    return table(heads, rows)
+            times = f"{none.mean():.1%}", f"{seconds:.1f}"
+            yield [views, f"{missing:.0%}", f"{wrong:.0%}", name, f"{middle:.2f}", f"{high:.2f}", *times]
 
 
 @section("stations.md", "coverage", draws=200)
 @torch.no_grad()
-def coverage(draws: int = 20_000) -> Iterator[str]:
+def coverage(draws: int = 20_000) -> Lines:
     """Table of shares inside the 95 % ellipsoids."""
-    rows = []
+    yield ["distance", *(f"V = {views}" for views in range(2, 9))]
     for kilometers in (1, 5, 20):
         cells: list[object] = [f"{kilometers} km"]
         for views in range(2, 9):
@@ -199,8 +195,7 @@ def coverage(draws: int = 20_000) -> Iterator[str]:
             squares = (error * torch.linalg.solve(found.covariance[ok], error)).sum(-1)
             sigma = found.covariance[ok].diagonal(dim1=-2, dim2=-1)[:, :2].sum(-1).sqrt().median()
             cells.append(f"{(squares < _CHI2_95).double().mean():.1%} ({float(sigma):.2g} m)")
-        rows.append(cells)
-    return table(["distance", *(f"V = {views}" for views in range(2, 9))], rows)
+        yield cells
 
 
 def clipped(polygon: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
@@ -224,9 +219,12 @@ def area(polygon: np.ndarray) -> float:
 
 @section("stations.md", "smoke", draws=20)
 @torch.no_grad()
-def smoke(draws: int = 2000) -> Iterator[str]:
+def smoke(draws: int = 2000) -> Lines:
     """Table of crossing bearings."""
-    rows = []
+    yield [
+        "distance", "cones contain it", "cones do not meet", "their area km²", "95 % ellipses contain it",
+        "no position", "their area km²", "median error m",
+    ]  # fmt: skip
     width, edge, shift, heading = 200.0, 5.0, 0.2, 0.2
     for kilometers in (5, 10, 20, 30):
         rig, generator = ring(3, 1e3 * kilometers), torch.Generator().manual_seed(kilometers)
@@ -247,9 +245,8 @@ def smoke(draws: int = 2000) -> Iterator[str]:
         ok = found.status == OK
         spread = found.covariance[:, :2, :2]
         error = (found.enu - points)[:, :2]
-        inside = (error * torch.linalg.solve(torch.where(ok[:, None, None], spread, torch.eye(2)), error)).sum(
-            -1
-        ) < 5.991
+        known = torch.where(ok[:, None, None], spread, torch.eye(2))
+        inside = (error * torch.linalg.solve(known, error)).sum(-1) < 5.991
         areas = math.pi * 5.991 * torch.linalg.det(spread[ok]).sqrt()
         hit, crossed = [], []
         for i in range(draws):
@@ -269,17 +266,12 @@ def smoke(draws: int = 2000) -> Iterator[str]:
             there = points[i, :2].numpy()
             hit.append(len(polygon) > 2 and _contains(polygon, there))
         some = [one for one in crossed if one > 0]
-        rows.append(
-            [f"{kilometers} km", f"{np.mean(hit):.0%}", f"{np.mean(np.array(crossed) == 0):.0%}",
-             f"{np.median(some) / 1e6:.3f}" if some else "", f"{(inside & ok).double().mean():.1%}",
-             f"{(~ok).double().mean():.0%}", f"{areas.median() / 1e6:.3f}",
-             f"{float(error[ok].norm(dim=-1).median()):.0f}"]
-        )  # fmt: skip
-    heads = [
-        "distance", "cones contain it", "cones do not meet", "their area km²", "95 % ellipses contain it",
-        "no position", "their area km²", "median error m",
-    ]  # fmt: skip
-    return table(heads, rows)
+        yield [
+            f"{kilometers} km", f"{np.mean(hit):.0%}", f"{np.mean(np.array(crossed) == 0):.0%}",
+            f"{np.median(some) / 1e6:.3f}" if some else "", f"{(inside & ok).double().mean():.1%}",
+            f"{(~ok).double().mean():.0%}", f"{areas.median() / 1e6:.3f}",
+            f"{float(error[ok].norm(dim=-1).median()):.0f}",
+        ]  # fmt: skip
 
 
 def _contains(polygon: np.ndarray, point: np.ndarray) -> bool:
@@ -290,7 +282,7 @@ def _contains(polygon: np.ndarray, point: np.ndarray) -> bool:
 
 @section("stations.md", "real")
 @torch.no_grad()
-def real() -> list[str]:
+def real() -> list[Line]:
     """Table for the four cameras and the walking person: two cameras' points seen by the others."""
     data = np.load(data_folder() / "stations" / "pose2sim.npz")
     cameras = []
@@ -330,7 +322,7 @@ def real() -> list[str]:
     note = f"{len(pixels)} joints; noise of a mark along an axis {sigma:.2f} px, from the joints that all four see; "
     offsets = ", ".join(f"{name} {one:.1f}" for name, one in zip(rig.names, off, strict=True))
     note += f"mean offset of a camera's marks: {offsets} px."
-    return [note, "", *table(heads, rows)]
+    return [note, heads, *rows]
 
 
 @section("stations.md", "picture")

@@ -6,13 +6,24 @@ filter (the package `stonesoup`) get the same pairs.
 
 from __future__ import annotations
 
+import collections
 import dataclasses
+import datetime
 import math
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from stonesoup.base import Property
+from stonesoup.models.measurement.base import MeasurementModel
+from stonesoup.models.measurement.linear import LinearGaussian
+from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
+from stonesoup.predictor.kalman import KalmanPredictor
+from stonesoup.types.array import StateVectors
+from stonesoup.types.detection import Detection
+from stonesoup.types.hypothesis import SingleHypothesis
+from stonesoup.types.state import GaussianState
+from stonesoup.updater.kalman import KalmanUpdater, UnscentedKalmanUpdater
 from torch import Tensor
 
 from kcal import Localizer, Origin, Rig
@@ -21,10 +32,152 @@ from kcal.pipeline.pairing import ObjectViews
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 from kcal.rig import RigCovariance, planned_rig
 from kcal.track import ClockPrior, Motion
-from scripts.check.track_rivals import CartesianFilters, OfPixels, OfPositions
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 from scripts.shared.timing import rms
+
+START = datetime.datetime(2026, 1, 1)
+
+
+class CartesianFilters:
+    """One filter for each target, with straight motion in east, north and up.
+
+    Args:
+        acceleration: white noise, as that of `Motion`.
+        speed: standard deviation of a new target's velocity along each axis.
+    """
+
+    def __init__(self, acceleration: float, speed: float) -> None:
+        self.predictor = KalmanPredictor(CombinedLinearGaussianTransitionModel([ConstantVelocity(acceleration**2)] * 3))
+        self.speed = speed
+        self.states: dict[int, Any] = {}
+
+    def begin(self, target: int, mean: Any, covariance: Any, time: float) -> None:
+        """A new target with the state (6,): place and velocity of each axis in turn."""
+        when = START + datetime.timedelta(seconds=time)
+        self.states[target] = GaussianState(mean[:, None], covariance, timestamp=when)
+
+    def update(self, target: int, updater: Any, seen: Any, time: float) -> None:
+        """Move a target to a time and take in a sighting (K,)."""
+        when = START + datetime.timedelta(seconds=time)
+        prediction = self.predictor.predict(self.states[target], timestamp=when)
+        made = updater.update(SingleHypothesis(prediction, Detection(np.asarray(seen)[:, None], timestamp=when)))
+        self.states[target] = GaussianState(made.state_vector, made.covar, timestamp=when)
+
+    def places(self, time: float) -> tuple[list[int], Tensor]:
+        """Targets and where they are believed to be."""
+        when = START + datetime.timedelta(seconds=time)
+        found = [self.predictor.predict(state, timestamp=when) for state in self.states.values()]
+        rows = [np.asarray(state.state_vector, float).ravel()[::2] for state in found]
+        return list(self.states), torch.from_numpy(np.array(rows))
+
+
+class OfPositions(CartesianFilters):
+    """Takes in positions with covariances, as one would without kcal's tracker."""
+
+    def take(self, targets: Tensor, enu: Tensor, covariance: Tensor, ok: Tensor, time: float) -> None:
+        """Take in the sightings of a moment."""
+        for i, target in enumerate(targets.tolist()):
+            if not bool(ok[i]):
+                continue
+            if target not in self.states:
+                mean, spread = np.zeros(6), np.diag([0.0, self.speed**2] * 3)
+                mean[::2], spread[::2, ::2] = enu[i].numpy(), covariance[i].numpy()
+                self.begin(target, mean, spread, time)
+                continue
+            updater = KalmanUpdater(LinearGaussian(6, (0, 2, 4), covariance[i].numpy()))
+            self.update(target, updater, enu[i].numpy(), time)
+
+
+class Pixels(MeasurementModel):
+    """Four pixel coordinates of a target, of which the right two are seen `delay` seconds later; pinholes only."""
+
+    ndim_state: int = 6
+    mapping: Any = (0, 2, 4)
+    cameras: Any = Property(doc="Matrix, rotation from east, north and up, and shift of both cameras.")
+    delay: float = Property(doc="Seconds.")
+    covariance: Any = Property(doc="Of the pixels.")
+
+    @classmethod
+    def of(cls, localize: Localizer, delay: float, covariance: Tensor) -> Pixels:
+        """The model of a rig that stands somewhere."""
+        rig, turn = localize.rig, localize.enu_from_rig.T
+        cameras = [
+            (camera.matrix.numpy(), rotation.numpy(), shift.numpy())
+            for camera, rotation, shift in (
+                (rig.left, turn, torch.zeros(3)),
+                (rig.right, rig.right_from_left_rotation @ turn, rig.right_from_left_translation),
+            )
+        ]
+        return cls(cameras=cameras, delay=delay, covariance=covariance.numpy())
+
+    @property
+    def ndim_meas(self) -> int:
+        """Four."""
+        return 4
+
+    def covar(self, **_: Any) -> Any:
+        """Of the pixels."""
+        return self.covariance
+
+    def function(self, state: Any, noise: Any = False, **_: Any) -> Any:
+        """Where states are seen."""
+        return StateVectors(self.seen_at(np.asarray(state.state_vector, float)))
+
+    def seen_at(self, vector: Any) -> Any:
+        """Pixels (4, N) of states (6, N)."""
+        rows: list[Any] = []
+        for (matrix, rotation, shift), delay in zip(self.cameras, (0.0, self.delay), strict=True):
+            seen = matrix @ (rotation @ (vector[::2] + delay * vector[1::2]) + shift[:, None])
+            rows += [seen[0] / seen[2], seen[1] / seen[2]]
+        return np.array(rows)
+
+    def born(self, seen: Any, place: Any, speed: float) -> tuple[Any, Any]:
+        """State and covariance of a new target at about a place (3,), by Gauss and Newton's method."""
+        state = np.zeros(6)
+        state[::2] = place
+        weight, prior = np.linalg.inv(self.covariance), np.diag([0.0, speed**-2] * 3)
+        for _ in range(6):
+            steps = np.diag([1.0, 0.1] * 3)
+            ends = np.hstack([state[:, None] + steps, state[:, None] - steps, state[:, None]])
+            values = self.seen_at(ends)
+            slope = (values[:, :6] - values[:, 6:12]) / (2 * np.diag(steps))
+            information = slope.T @ weight @ slope + prior
+            state = state + np.linalg.solve(information, slope.T @ weight @ (seen - values[:, 12]) - prior @ state)
+        return state, np.linalg.inv(information)
+
+    def rvs(self, *_: Any, **__: Any) -> Any:
+        """Not needed."""
+        raise NotImplementedError
+
+    def pdf(self, *_: Any, **__: Any) -> Any:
+        """Not needed."""
+        raise NotImplementedError
+
+
+class OfPixels(CartesianFilters):
+    """Takes in the pairs themselves, unscented: the same information as kcal's tracker, in other coordinates."""
+
+    def take(self, targets: Tensor, pairs: ObjectViews, places: Tensor, localize: Localizer, offset: float) -> None:
+        """Take in the pairs of a moment.
+
+        Args:
+            targets: whose each pair is.
+            pairs: of one moment.
+            places: (N, 3) of the pairs alone, east, north, up: where the search for new targets begins.
+            localize: the rig.
+            offset: seconds by which the right images are later than their times say.
+        """
+        for i, target in enumerate(targets.tolist()):
+            time = float(pairs.time[i, 0])
+            seen = torch.cat([pairs.left[i], pairs.right[i]]).numpy()
+            delay = float(pairs.time[i, 1]) + offset - time
+            model = Pixels.of(localize, delay, pairs.covariance[i])
+            if target not in self.states:
+                self.begin(target, *model.born(seen, places[i].numpy(), self.speed), time)
+                continue
+            self.update(target, UnscentedKalmanUpdater(model, alpha=1.0, kappa=0.0), seen, time)
+
 
 # Degrees: the relative yaw is known to this, 44 m at 5 km.
 YAW_SIGMA = 0.001
@@ -124,23 +277,19 @@ def gospa(found: Tensor, true: Tensor, cutoff: float) -> float:
     return math.sqrt(float(matched[real].sum() + cutoff**2 / 2 * alone))
 
 
-class Figures:
-    """Sums over seeds."""
+class Figures(collections.defaultdict[str, list[Tensor]]):
+    """Values over seeds by name."""
 
     def __init__(self) -> None:
-        self.errors: dict[str, list[Tensor]] = {}
-        self.numbers: dict[str, list[float]] = {}
+        super().__init__(list)
 
     def add(self, name: str, values: Tensor | float) -> None:
         """Keep values under a name."""
-        if isinstance(values, Tensor):
-            self.errors.setdefault(name, []).append(values.double().flatten())
-        else:
-            self.numbers.setdefault(name, []).append(values)
+        self[name].append(torch.as_tensor(values, dtype=torch.float64).flatten())
 
     def all(self, name: str) -> Tensor:
         """All that was kept."""
-        return torch.cat(self.errors[name])
+        return torch.cat(self[name])
 
 
 def relative(state: Any, true: Tensor) -> Tensor:
@@ -247,9 +396,7 @@ def compare(
 
 
 @section("tracks.md", "tracks", seeds=range(1), seconds=4.0, clock_seeds=1, clock_seconds=3.0)
-def tracks(
-    seeds: range = range(4), seconds: float = 12.0, clock_seeds: int = 4, clock_seconds: float = 60.0
-) -> Iterator[str]:
+def tracks(seeds: range = range(4), seconds: float = 12.0, clock_seeds: int = 4, clock_seconds: float = 60.0) -> Lines:
     """Seeds and seconds of the tracks, and of the runs of the clock."""
     figures = Figures()
     for seed in seeds:
@@ -257,72 +404,61 @@ def tracks(
     for seed in range(clock_seeds):
         run_clock(100 + seed, clock_seconds, figures)
     meters = 5000.0**2
-    rows: list[list[object]] = [["single frame", f"{rms(figures.all('single')) * meters:,.0f} m", ""]]
-    for name in ("1 s", "10 s"):
-        if f"range {name}" in figures.errors:
-            error, bound = rms(figures.all(f"range {name}")), rms(figures.all(f"bound {name}"))
-            rows.append([f"after {name}", f"{error * meters:,.0f} m", f"{error / bound:.2f}"])
-    outputs = [
-        [name, f"{100 * float((figures.all(key).abs() < 1.96).double().mean()):.1f} %", len(figures.all(key))]
-        for name, key in (("range", "filter"), ("position, each axis", "position"), ("velocity, each axis", "velocity"),
-                          ("range, smoothed", "smoother"), ("clock offset", "clock"))
-    ]  # fmt: skip
-    offset = figures.all("clock ms")
-    # Of a target at 30 m/s that crosses at 5 km: range times speed over baseline.
-    lost = [5000.0 * 30.0 / 10.0 * ms / 1e3 for ms in (40.0, rms(offset))]
     yield (
         f"{TARGETS} targets from 100 m to 5 km, six of them at 5 km and 30 m/s; cameras of 10 and 25 frames a second; "
         f"boxes {BEARING_PX} px, matching {MATCH_PX} px; relative yaw known to {YAW_SIGMA}°; {seconds:g} s, "
         f"{len(seeds)} draws of rig, targets and noise."
     )
+    yield ["range at 5 km", "RMS of error (of the inverse range, times 5 km squared)", "over its stated sigma"]
+    yield ["single frame", f"{rms(figures.all('single')) * meters:,.0f} m", ""]
+    for name in ("1 s", "10 s"):
+        if f"range {name}" in figures:
+            error, bound = rms(figures.all(f"range {name}")), rms(figures.all(f"bound {name}"))
+            yield [f"after {name}", f"{error * meters:,.0f} m", f"{error / bound:.2f}"]
     yield ""
-    yield from table(
-        ["range at 5 km", "RMS of error (of the inverse range, times 5 km squared)", "over its stated sigma"], rows
-    )
-    yield ""
-    yield from table(["output", "in the 95 % interval", "cases"], outputs)
-    yield ""
+    yield ["output", "in the 95 % interval", "cases"]
+    for name, key in (("range", "filter"), ("position, each axis", "position"), ("velocity, each axis", "velocity"),
+                      ("range, smoothed", "smoother"), ("clock offset", "clock")):  # fmt: skip
+        values = figures.all(key)
+        yield [name, f"{100 * float((values.abs() < 1.96).double().mean()):.1f} %", len(values)]
     smallest = float(figures.all("floor").min())
     yield f"Smallest eigenvalue of covariance minus systematic part, over its trace: {smallest:.1e}."
+    offset = figures.all("clock ms")
+    # Of a target at 30 m/s that crosses at 5 km: range times speed over baseline.
+    lost = [5000.0 * 30.0 / 10.0 * ms / 1e3 for ms in (40.0, rms(offset))]
     yield ""
     yield (
         f"Clock: offset of {1e3 * OFFSET:g} ms found with an RMS error of {rms(offset):.2f} ms, stated "
         f"{rms(figures.all('clock sigma ms')):.2f} ms. A target at 30 m/s that crosses at 5 km is wrong by "
         f"{lost[0]:.0f} m without and {lost[1]:.0f} m with it."
     )
-    yield ""
-    mean = {name: float(np.mean(values)) for name, values in figures.numbers.items()}
-    missed, doubled, followed = (sum(figures.numbers[f"pixels: {name}"]) for name in ("missed", "doubled", "followed"))
-    kinds = {
-        "equal information: the pairs, the true rig, the clock; unscented, Cartesian": "pixels",
-        "positions as measurements, Kalman filter, Cartesian; the believed rig": "positions",
-    }
-    both = ((what, mean[f"{kind}: kcal"], mean[f"{kind}: stonesoup"]) for what, kind in kinds.items())
-    yield from table(
-        ["GOSPA (cutoff 300 m) of the targets that both follow", "kcal", "Stone Soup", "kcal over Stone Soup"],
-        ([what, f"{own:.1f} m", f"{other:.1f} m", f"{own / other:.3f}"] for what, own, other in both),
+    yield ["GOSPA (cutoff 300 m) of the targets that both follow", "kcal", "Stone Soup", "kcal over Stone Soup"]
+    for what, kind in (
+        ("equal information: the pairs, the true rig, the clock; unscented, Cartesian", "pixels"),
+        ("positions as measurements, Kalman filter, Cartesian; the believed rig", "positions"),
+    ):
+        own, other = (float(figures.all(f"{kind}: {who}").mean()) for who in ("kcal", "stonesoup"))
+        yield [what, f"{own:.1f} m", f"{other:.1f} m", f"{own / other:.3f}"]
+    missed, doubled, followed = (
+        float(figures.all(f"pixels: {name}").sum()) for name in ("missed", "doubled", "followed")
     )
-    yield ""
     yield (
         f"Stone Soup's filters are told whose each sighting is. Of {followed:,.0f} targets in all moments kcal's "
         f"tracker has no position for {missed:,.0f} and two for {doubled:,.0f}."
     )
-    yield ""
     yield from clock_table(figures, clock_seconds)
 
 
-def clock_table(figures: Figures, seconds: float) -> Iterator[str]:
+def clock_table(figures: Figures, seconds: float) -> Lines:
     error, sigma = (figures.all(name).reshape(-1, 3) for name in ("long clock", "long clock sigma"))
-    rows: list[list[object]] = []
+    yield [f"clock after {seconds:g} s", "truth", "RMS of error", "stated sigma", "in the 95 % interval"]
     for column, (what, true, unit, scale) in enumerate((
         ("offset at the end", OFFSET + DRIFT * seconds, "ms", 1e3),
         ("drift", DRIFT, "ppm", 1e6),
         ("last row against first", SLOPE, "ms", 1e3),
     )):  # fmt: skip
         inside = int((error[:, column].abs() < 1.96 * sigma[:, column]).sum())
-        rows.append([
+        yield [
             what, f"{scale * true:g} {unit}", f"{scale * rms(error[:, column]):.2f} {unit}",
             f"{scale * rms(sigma[:, column]):.2f} {unit}", f"{inside} of {len(error)}",
-        ])  # fmt: skip
-    head = [f"clock after {seconds:g} s", "truth", "RMS of error", "stated sigma", "in the 95 % interval"]
-    return table(head, rows)
+        ]  # fmt: skip

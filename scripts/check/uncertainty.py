@@ -19,14 +19,12 @@ from kcal.lens.pose import step_rows
 from kcal.lens.projection import project_components
 from scripts.shared.page import table
 from scripts.shared.sections import section
-from scripts.shared.views import MODELS, NOISE, SIZE, observed, simulate
+from scripts.shared.views import MODELS, NOISE, SIZE, WEAK, observed, simulate
 
 VIEWS = 30
-WEAK = 0.3
 # The middle, half way to a corner, and near two corners.
 PLACES = ((960.0, 540.0), (1440.0, 810.0), (100.0, 80.0), (1820.0, 100.0))
 ELLIPSE = -2.0 * math.log(0.05)  # the 95 % quantile of χ² with two degrees of freedom
-NORMAL = 1.959964**2  # with one
 MEDIAN = 0.674490  # of |x| of a normal variable
 # Of each model; mild enough to be regular all over the image.
 LENS = (-0.25, 0.08, 5e-4, -3e-4, -0.02, 0.03, -0.01, 0.003, 4e-4, -2e-4, -3e-4, 2e-4, 0.004, -0.003)
@@ -60,9 +58,8 @@ def refit(pixels: Tensor, options: CalibrationOptions, truth: Camera, rays: Tens
     seen = project_components(rays.T, result.camera.params, model, names)
     regular = seen.regular[:, None]
     error = torch.where(regular, seen.pixels.T - wanted.detach(), 0.0)
-    by_lens = torch.where(regular, seen.by_camera.movedim(-1, 0).transpose(-1, -2).flatten(1), 0.0).unflatten(
-        1, (2, -1)
-    )
+    by_lens = seen.by_camera.movedim(-1, 0).transpose(-1, -2).flatten(1)
+    by_lens = torch.where(regular, by_lens, 0.0).unflatten(1, (2, -1))
     turns = torch.where(regular, step_rows(seen.by_point, rays.T)[:3].movedim(-1, 0).transpose(-1, -2).flatten(1), 0.0)
     turns = turns.unflatten(1, (2, 3))
     # The turn of the camera that brings the grid closest, and how it follows the parameters.

@@ -23,7 +23,7 @@ from kcal.rig import Mounting, RigCovariance, planned_rig
 from kcal.watch.history import AngleSeries, Look, TurnModel, between_rows, first_state, learned, passed, taken, turns_of
 from kcal.watch.turned import drift_of_turns
 from kcal.watch.watcher import LIMIT, exceeded
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 from scripts.shared.sections import section
 
 RIG = planned_rig()
@@ -104,13 +104,12 @@ def looks(true: Truth, every: float, seed: int, *, heat: bool) -> list[Look]:
     for k in range(count):
         some = true.seen[k].clamp_min(1.0)
         sigma = FEATURE / some.sqrt()[:, None]
-        wide = sigma / math.sqrt(1.0)
 
         def noise() -> Tensor:
             return torch.randn(chains, 6, generator=random, dtype=torch.float64)
 
         turn = true.slow[k] + true.wind[:, None] * noise()
-        turn = turn + wide * (math.sqrt(1.0 - LASTING) * noise() + math.sqrt(LASTING) * (steady[k] - steady[0]))
+        turn = turn + sigma * (math.sqrt(1.0 - LASTING) * noise() + math.sqrt(LASTING) * (steady[k] - steady[0]))
         wrong = torch.rand(chains, 1, generator=random) < 0.005
         turn = torch.where(wrong & (k > 0), turn + math.radians(0.05) * noise(), turn)
         seen = (true.seen[k] > 0)[:, None].expand(chains, 2)
@@ -122,11 +121,6 @@ def looks(true: Truth, every: float, seed: int, *, heat: bool) -> list[Look]:
             matched=torch.zeros(chains, dtype=torch.bool), kelvin=true.kelvin[k] if heat else zero,
         ))  # fmt: skip
     return found
-
-
-def one(look: Look, chain: int) -> Look:
-    """Of one rig."""
-    return Look(*(value[chain] for value in look))
 
 
 def learned_each(true: Truth, found: list[Look], every: float) -> TurnModel:
@@ -270,13 +264,13 @@ def drifts(chains: int, every: float, model: TurnModel) -> list[list[object]]:
 
 
 @section("watch.md", "swing", chains=5, days=0.1, every=1200.0, targets=10)
-def swing(chains: int = 200, days: float = 5.0, every: float = 120.0, targets: int = 2000) -> Iterator[str]:
+def swing(chains: int = 200, days: float = 5.0, every: float = 120.0, targets: int = 2000) -> Lines:
     heads = ["swing", "temperature", "days and nights", "false alarms", "a month", "of the swing removed by day"]
     heads += ["in dark and gaps", "inside 95 % by day", "inside, dark and gaps", "inside, rig file"]
     # Alarms need the thousand days.
-    cases = ((STRONG, True, 5), (STRONG, False, 5), (MILD, True, 5), (MILD, False, 1))
-    rows = (day_and_night(chains // part, days, every, targets, peaks, heat=heat)[0] for peaks, heat, part in cases)
-    return table(heads, rows)
+    yield heads
+    for peaks, heat, part in ((STRONG, True, 5), (STRONG, False, 5), (MILD, True, 5), (MILD, False, 1)):
+        yield day_and_night(chains // part, days, every, targets, peaks, heat=heat)[0]
 
 
 @section("watch.md", "drift", chains=5, every=1200.0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from unittest import mock
 
 import torch
@@ -20,8 +20,8 @@ from kcal.calibrate.rig.result import RigResult
 from kcal.finding import sentences
 from kcal.locate import enu_from_cam
 from kcal.rig import RigCovariance
-from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import table
+from scripts.shared.long_range import ORIGIN, RANGES, landmarks_of, rig, with_noise
+from scripts.shared.page import Lines
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 from scripts.shared.timing import share
 
@@ -106,26 +106,10 @@ def drawn(kind: str, seed: int) -> tuple[Rig, Landmarks, Record]:
     scale = baseline / float(TRUTH.baseline)
     truth = Rig.pair(TRUTH.left, TRUTH.right, TRUTH.right_from_left_rotation, scale * TRUTH.right_from_left_translation)
     pixels, seen = truth(points)
-    (left, right), seen = pixels.unbind(-2), seen.all(-1)
-    seen &= points[:, 2] > 30.0
-    kept = seen.nonzero()[:count, 0]
-    exact = Landmarks(
-        names=tuple(f"post {i}" for i in range(len(kept))),
-        points=points[kept] @ LOOK,
-        sigma=torch.full((len(kept), 3), survey, dtype=torch.float64),
-        pixels=torch.stack([left, right], 1)[kept],
-        pixel_sigma=mark,
-    )
+    kept = (seen.all(-1) & (points[:, 2] > 30.0)).nonzero()[:count, 0]
+    exact = landmarks_of(points[kept] @ LOOK, pixels[kept], survey, mark)
     head = {"kind": kind, "seed": seed, "baseline": baseline, "count": len(kept), "distance": distance}
     return truth, exact, head
-
-
-def noisy(exact: Landmarks, draw: Draw) -> Landmarks:
-    return dataclasses.replace(
-        exact,
-        points=exact.points + exact.sigma * draw.normal(*exact.points.shape),
-        pixels=exact.pixels + exact.pixel_sigma * draw.normal(*exact.pixels.shape),
-    )
 
 
 def judged(truth: Rig, found: RigResult, draw: Draw, widen: float = 1.0) -> tuple[list[float], list[float]]:
@@ -184,7 +168,7 @@ def one(kind: str, seed: int) -> Record:
     for number in range(DRAWS):
         draw = Draw(10_000 * FIRST + 1000 * seed + 10 * number + list(KINDS).index(kind))
         try:
-            found = unchecked(truth, noisy(exact, draw))
+            found = unchecked(truth, with_noise(exact, draw.generator))
         except KcalError as error:
             if not number:
                 return record | {"outcome": "refused", "said": str(error), "usable": False}
@@ -217,13 +201,15 @@ def checked(truth: Rig, found: RigResult, draw: Draw) -> Record:
 
 
 @section("rig.md", "weak geometry", part=0.001, kinds=("random",))
-def weak_geometry(kept: Kept = NOT_KEPT, part: float = 1.0, kinds: tuple[str, ...] = tuple(KINDS)) -> Iterator[str]:
+def weak_geometry(kept: Kept = NOT_KEPT, part: float = 1.0, kinds: tuple[str, ...] = tuple(KINDS)) -> Lines:
     """How many sets are refused and warned of, and of their intervals contain the truth; a part of the sets."""
     numbers = {kind: math.ceil(part * KINDS[kind]) for kind in kinds}
     wanted = sorted((seed / KINDS[kind], kind, seed) for kind, count in numbers.items() for seed in range(count))
     records = kept.records((each[1:] for each in wanted), one, lambda record: record["outcome"])
-    heads = ("sets", "number", "refused", "warned", "accepted")
-    rows = []
+    yield [
+        "sets", "number", "refused", "warned", "accepted", "accepted contain", "warned contain", "warned, not widened",
+        "usable refused",
+    ]  # fmt: skip
     groups = {"random": ("random",), "nearly degenerate, all": DEGENERATE, **{kind: (kind,) for kind in KINDS}}
     for name, members in groups.items():
         own = [record for record in records if record["kind"] in members and record["outcome"] != "too few seen"]
@@ -233,13 +219,10 @@ def weak_geometry(kept: Kept = NOT_KEPT, part: float = 1.0, kinds: tuple[str, ..
         usable = [r for r in own if r["usable"]]
         lost = sum(r["outcome"] == "refused" for r in usable)
         counts = [len(by[what]) for what in ("refused", "warned", "accepted")]
-        rows.append(
-            [name, len(own), *counts]
-            + [percent([r["contained"] for r in by[what]]) for what in ("accepted", "warned")]
-            + [percent([r["unchecked"] for r in by["warned"] if "unchecked" in r]), f"{lost} of {len(usable)}"]
-        )
-    contain = ("accepted contain", "warned contain", "warned, not widened", "usable refused")
-    return table((*heads, *contain), rows)
+        yield [
+            name, len(own), *counts, *(percent([r["contained"] for r in by[what]]) for what in ("accepted", "warned")),
+            percent([r["unchecked"] for r in by["warned"] if "unchecked" in r]), f"{lost} of {len(usable)}",
+        ]  # fmt: skip
 
 
 def percent(shares: Sequence[Sequence[float]]) -> str:

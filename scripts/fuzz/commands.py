@@ -90,11 +90,7 @@ def _project(path: Path) -> None:
 
 # What is run on each kind of file; FILE is the damaged one, the others are whole.
 COMMANDS: dict[str, list[str | Callable[[Path], object]]] = {
-    "camera.json": [
-        "bake FILE -o out.npz --tolerance 0.5",
-        "rectify FILE image.png -o u",
-        "rays FILE -o r.npz",
-    ],
+    "camera.json": ["bake FILE -o out.npz --tolerance 0.5", "rectify FILE image.png -o u", "rays FILE -o r.npz"],
     "rig.json": ["locate FILE marks.csv -o out.csv -o out.kml -o out.cot -o out.geojson", "budget FILE"],
     "obs.json": ["calibrate FILE --model pinhole -o out.json", "compare FILE --model pinhole --parts 2"],
     "board.json": [load_measured_board],

@@ -11,7 +11,6 @@ two cameras differ by no more than both state (`kcal.lens.camera_difference`).
 from __future__ import annotations
 
 import functools
-import math
 import statistics
 import time
 from collections.abc import Sequence
@@ -22,7 +21,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.lens import camera_difference
 from scripts.paper.site import KINDS, observe, paper_scene
 from scripts.paper.train_eq12 import by_least_squares
-from scripts.shared.held_out import held_out
+from scripts.shared.held_out import of_halves
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.page import table
 from scripts.shared.real_captures import load, names
@@ -79,12 +78,9 @@ def measured(capture: str, lens: str, work: Path, views: int = VIEWS) -> Record:
         cameras = [fitted(half, lens)[0] for half in halves]
     except KcalError as error:
         return record | {"half_refused": str(error)}
-    judged = [held_out(c, o.board.points, o.pixels()) for c, o in zip(cameras, halves[::-1], strict=True)]
-    lost, corners = sum(one.lost for one in judged), sum(one.corners for one in judged)
-    for key in ("still", "moved"):
-        record[key] = math.sqrt(sum(getattr(one, key) for one in judged) / max(1, corners - lost))
     found = camera_difference(*cameras)
-    return record | {"lost": lost, "ratio": found.ratio, "probability": found.probability}
+    judged = of_halves(cameras, [(half, None) for half in halves])
+    return record | judged | {"ratio": found.ratio, "probability": found.probability}
 
 
 def cells(record: Record) -> list[str]:

@@ -12,8 +12,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from kcal.report.figures import new_figure, save_picture
 from kcal.texts import range_text
-from scripts.paper.numbers import (
+from scripts.paper.page import (
     DISTANCES,
+    LIMIT,
     SHOWN,
     TABLE_3,
     Results,
@@ -24,7 +25,6 @@ from scripts.paper.numbers import (
     reprojection,
     rig_share,
 )
-from scripts.paper.split import LIMIT
 from scripts.shared.page import DOCS
 
 COLORS = {

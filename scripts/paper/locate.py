@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Camera, KcalError, Landmarks, Localizer, RigData, RigOptions, solve_rig
+from kcal import Camera, KcalError, Localizer, RigData, RigOptions, solve_rig
 from kcal.sim.scene import DemoScene
 from scripts.paper.site import MARK_SIGMA, SURVEY_SIGMA, PaperScene
-from scripts.shared.long_range import range_sigma
+from scripts.shared.long_range import landmarks_of, range_sigma
 
 SIDES = ("left", "right")
 DRAWS, MARKINGS = 10, 10  # of the landmarks' noise, and of the seven points' marks for each of them
@@ -121,17 +121,11 @@ def bound(scene: DemoScene) -> list[float]:
     return range_sigma(scene.rig, scene.points_rig(scene.targets), MARK_SIGMA).tolist()
 
 
-def by_kcal(scene: DemoScene, cameras: tuple[Camera, Camera]) -> Orient:
+def by_kcal(cameras: tuple[Camera, Camera]) -> Orient:
     """`solve_rig` on the landmarks, and `Localizer`."""
 
     def orient(points: Tensor, left: Tensor, right: Tensor) -> Rig:
-        landmarks = Landmarks(
-            names=scene.landmarks.names,
-            points=points,
-            sigma=torch.full_like(points, SURVEY_SIGMA),
-            pixels=torch.stack([left, right], 1),
-            pixel_sigma=MARK_SIGMA,
-        )
+        landmarks = landmarks_of(points, torch.stack([left, right], 1), SURVEY_SIGMA, MARK_SIGMA)
         try:
             # Nothing is left out: a lens model that contradicts the landmarks is to show it.
             # The simulated light goes straight.

@@ -17,14 +17,7 @@ from torch import Tensor, nn
 from kcal.checks import as_points
 from kcal.errors import InputError
 from kcal.lens.pose import apply_twist, step_rows
-from kcal.nets.inverse import (
-    Network,
-    Widths,
-    evaluate,
-    evaluate_with_slopes,
-    fit_weights,
-    initial_weights,
-)
+from kcal.nets.inverse import Network, Widths, evaluate, evaluate_with_slopes, fit_weights, initial_weights
 from kcal.solve.lm import LMOptions, Result, State
 from kcal.solve.schur import SchurProblem
 

@@ -12,15 +12,14 @@ from __future__ import annotations
 import functools
 import itertools
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from scripts.paper.figures import write_figures
-from scripts.paper.numbers import Results
-from scripts.paper.page import SECTIONS
+from scripts.paper.page import SECTIONS, Results, table_2
 from scripts.paper.site import KINDS
 from scripts.paper.solve import ALL, run_seed
-from scripts.paper.tables import table_2
+from scripts.shared.page import Line, Lines
 from scripts.shared.sections import section
 
 # Of runs in little, which share one draw.
@@ -36,12 +35,12 @@ def results_of(work: Path, seeds: int, views: int, kinds: tuple[str, ...], model
     return results
 
 
-def _registered(name: str, made: Callable[[Results], Iterable[str]]) -> None:
+def _registered(name: str, made: Callable[[Results], Iterable[Line]]) -> None:
     @section("paper.md", name, kinds=("vision",), seeds=1, views=5, models=("14",), work=Path(_LITTLE.name))
     def part(
         work: Path = Path("build/paper"), seeds: int = 5, views: int = 30, kinds: tuple[str, ...] = tuple(KINDS),
         models: tuple[str, ...] = tuple(ALL), write: bool = False,
-    ) -> Iterator[str]:  # fmt: skip
+    ) -> Lines:  # fmt: skip
         """Views of each camera; corners and results stay in the folder."""
         if not set(kinds) <= {*KINDS}:
             raise SystemExit(f"kinds of cameras: {', '.join(KINDS)}")

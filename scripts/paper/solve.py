@@ -19,15 +19,7 @@ from scripts.shared.infinity import error_at_infinity
 from scripts.shared.peer_lenses import as_camera, calibrated
 
 # What the paper calls 14, 16, 18, 20, 20 (its second one), 22 and 24 parameters.
-MODELS = {
-    "14": "opencv14",
-    "16": "ext16",
-    "18": "ext18",
-    "20": "ext20",
-    "20b": "ext20b",
-    "22": "ext22",
-    "24": "ext24",
-}
+MODELS = {"14": "opencv14", "16": "ext16", "18": "ext18", "20": "ext20", "20b": "ext20b", "22": "ext22", "24": "ext24"}
 ALL = {**MODELS, "hybrid": "hybrid"}
 NAN = math.nan
 # What ends one model and not the whole run.
@@ -116,7 +108,7 @@ class _Run:
                 for side, lens in self.true.items()
             }
             cameras = pair["left"][0], pair["right"][0]
-            self.result["located"][label] = judge(self.scene, by_kcal(self.scene, cameras))
+            self.result["located"][label] = judge(self.scene, by_kcal(cameras))
         self._keep()
 
     def _keep(self) -> None:

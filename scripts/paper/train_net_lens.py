@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +26,7 @@ from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.problem.views import Views, poses_under
 from kcal.solve.lm import LMOptions, State, minimize
 from scripts.paper.pure_lens import PureLensNet, PureLensProblem, train_pure_lens
-from scripts.shared.page import table
+from scripts.shared.page import Lines
 from scripts.shared.sections import section
 from scripts.shared.timing import median, spread
 from scripts.shared.views import NOISE, SIZE, observed, simulate
@@ -140,14 +139,15 @@ def draw(runs: dict[str, dict[str, list[Run]]], path: Path) -> None:
 @section("paper.md", "net lens", steps=1, lm_steps=3, seeds=1, views=4)
 def net_lens(
     steps: int = 2000, lm_steps: int = 1000, seeds: int = 3, views: int = 20, picture: Path | None = None
-) -> Iterator[str]:
+) -> Lines:
     """`views`: fitted, and as many held out. `picture`: draw RMS over steps into this file."""
     data, more = simulate(views), simulate(views, seed=1000)
     board, pixels, others = (torch.from_numpy(a) for a in (data["board"], data["pixels"], more["pixels"]))
     true_poses = torch.from_numpy(more["rotation"]), torch.from_numpy(more["translation"])
     base = fit_projection(board, pixels, SIZE, torch.ones_like(pixels[..., 0])).state
     intrinsics, poses = base.parameters[:4], (base.rotation, base.translation)
-    rows = [reference(board, pixels, others)]
+    yield ["network", "method", "learning rate", "CPU s", "RMS px", "held-out RMS px"]
+    yield reference(board, pixels, others)
     runs: dict[str, dict[str, list[Run]]] = {}
     for form, skip in (("as in the figure", False), ("with a skip", True)):
         runs[form] = {}
@@ -165,10 +165,9 @@ def net_lens(
                     repeats.append(descend(problem, start, method, rate, steps))
                 outside.append(held_out(board, others, lens, repeats[-1].state, true_poses))
             runs[form][method] = repeats
-            rows.append([
+            yield [
                 form, method, "" if rate is None else f"{rate:.0e}", median([run.seconds for run in repeats]),
                 spread([float(np.nanmin(run.rms)) for run in repeats], 4), spread(outside, 4),
-            ])  # fmt: skip
+            ]  # fmt: skip
     if picture:
         draw(runs, picture)
-    return table(["network", "method", "learning rate", "CPU s", "RMS px", "held-out RMS px"], rows)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import cv2
@@ -20,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcal import Observations
 from kcal.calibrate.hybrid.board_modes import board_modes
 
 BOARD_PRIOR, TWIST_PRIOR = 1e-3, 2e-3  # of the board's extent; radians, and distances of the board
@@ -174,6 +176,19 @@ def held_out(camera: Projection, points: Tensor, pixels: Tensor, weight: Tensor 
     return HeldOut(sums[0], sums[1], int(problem.seen.sum()), int(without.sum()))
 
 
+def of_halves(cameras: Sequence[Projection], halves: Sequence[tuple[Observations, Tensor | None]]) -> dict[str, float]:
+    """RMS of each half's camera on the other half, both together, pixels; corners, and how many have no image."""
+    found = [
+        held_out(camera, seen.board.points, seen.pixels(), weight)
+        for camera, (seen, weight) in zip(cameras, halves[::-1], strict=True)
+    ]
+    corners, lost = sum(one.corners for one in found), sum(one.lost for one in found)
+    rms = {
+        key: math.sqrt(sum(getattr(one, key) for one in found) / max(1, corners - lost)) for key in ("still", "moved")
+    }
+    return {**rms, "lost": lost, "corners": corners}
+
+
 def _start(problem: _Problem) -> _State | None:
     """The better of both planar poses of each view; None if a view has hardly a ray."""
     rays, valid = problem.camera.unproject(torch.from_numpy(problem.pixels))
@@ -204,12 +219,7 @@ def _start(problem: _Problem) -> _State | None:
         state = _solve(problem, state, distance, moves=False, shared=False)
         cost = np.nan_to_num(problem.squares(state, distance), nan=math.hypot(*problem.camera.size) ** 2).sum(1)
         if best is not None:
-            keep = best[1] <= cost
-            state = dataclasses.replace(
-                state,
-                rotation=np.where(keep[:, None, None], best[0].rotation, state.rotation),
-                middle=np.where(keep[:, None], best[0].middle, state.middle),
-            )
+            state = _chosen(best[1] <= cost, best[0], state)
             cost = np.minimum(cost, best[1])
         best = state, cost
     return best[0] if best else None

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcal.errors import InputError
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens.pose import rotation_between, rotation_from_vector
 from kcal.sim.captures import LensLike
 
 _TURN_STEPS = 4
@@ -72,7 +72,7 @@ def error_at_infinity(camera: LensLike, truth: LensLike, *, columns: int = 49, r
     both = known & seen
     if int(both.sum()) < 3:
         raise InputError("error_at_infinity: the camera and the truth have no rays in common")
-    rotation = _kabsch(rays[both], seen_rays[both])
+    rotation = rotation_between(rays[both], seen_rays[both])
     flat = pixels.reshape(-1, 2)
     errors, valid = _errors_after_turn(camera, flat, rays, known, rotation)
     for _ in range(_TURN_STEPS):
@@ -105,11 +105,3 @@ def _errors_after_turn(
 ) -> tuple[Tensor, Tensor]:
     found, valid = camera.project((rays @ rotation.T) * 1e9)
     return found - pixels, valid & known
-
-
-def _kabsch(source: Tensor, target: Tensor) -> Tensor:
-    """Find the rotation that best turns unit vectors (N, 3) into others (W. Kabsch, Acta Cryst. A32, 1976)."""
-    u, _, vh = torch.linalg.svd(target.T @ source)
-    sign = torch.ones(3, dtype=torch.float64)
-    sign[2] = torch.sign(torch.linalg.det(u @ vh))
-    return u @ torch.diag(sign) @ vh

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from kcal import Camera, Features, Origin, Rig
+from kcal import Camera, Features, Landmarks, Origin, Rig
 from kcal.lens import rotation_from_vector
 
 RANGES = (100.0, 250.0, 500.0, 1000.0, 2000.0, 3500.0, 5000.0)
@@ -29,6 +30,19 @@ def matches_of(pixels: Tensor, **noise: Any) -> Features:
     nothing = torch.zeros(len(pixels), dtype=torch.float64)
     names, sigma = tuple(map(str, range(len(pixels)))), torch.full_like(nothing, torch.inf)
     return Features(names=names, pixels=pixels, inverse_range=nothing, inverse_range_sigma=sigma, **noise)
+
+
+def landmarks_of(points: Tensor, pixels: Tensor, survey: float, mark: float) -> Landmarks:
+    """Landmarks (L, 3) and their marks (L, V, 2) without noise, as known to `survey` meters and `mark` pixels."""
+    names = tuple(f"post {i}" for i in range(1, len(points) + 1))
+    return Landmarks(names=names, points=points, sigma=torch.full_like(points, survey), pixels=pixels, pixel_sigma=mark)
+
+
+def with_noise(exact: Landmarks, draw: torch.Generator) -> Landmarks:
+    """The same, surveyed and marked with the errors that they state."""
+    survey = exact.sigma * torch.randn(exact.points.shape, dtype=torch.float64, generator=draw)
+    marks = exact.pixel_sigma * torch.randn(exact.pixels.shape, dtype=torch.float64, generator=draw)
+    return dataclasses.replace(exact, points=exact.points + survey, pixels=exact.pixels + marks)
 
 
 def range_sigma(project: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor, mark: float) -> Tensor:

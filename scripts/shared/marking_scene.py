@@ -94,10 +94,7 @@ def finished(image: Floats, noise: float, random: np.random.Generator) -> NDArra
 def site_rig(width: int = 1280, height: int = 720) -> Rig:
     """Two unlike, distorted cameras 10 m apart; f 1600 px at a width of 1920."""
     unit = width / 1920
-    lenses = (
-        (1602, 4.3, -3.2, [-0.18, 0.05, 3e-4, -2e-4]),
-        (1611, -6.1, 4.4, [-0.17, 0.04, -2e-4, 3e-4]),
-    )
+    lenses = ((1602, 4.3, -3.2, [-0.18, 0.05, 3e-4, -2e-4]), (1611, -6.1, 4.4, [-0.17, 0.04, -2e-4, 3e-4]))
     cameras = [
         Camera.build(
             focal=(f * unit, f * unit), center=(width / 2 + u, height / 2 + v), size=(width, height), coefficients=lens
@@ -215,6 +212,5 @@ def background(rig: Rig, side: int, random: np.random.Generator, amplitude: floa
         wave = np.sin(frequency * (azimuth * math.cos(turn) + elevation * math.sin(turn)) + phase)
         light += amplitude * wave * (elevation < 0.06)
     coarse = torch.from_numpy(light.reshape(1, 1, height // 4 + 2, width // 4 + 2))
-    return torch.nn.functional.interpolate(coarse, size=(height, width), mode="bicubic", align_corners=True)[
-        0, 0
-    ].numpy()
+    fine = torch.nn.functional.interpolate(coarse, size=(height, width), mode="bicubic", align_corners=True)
+    return fine[0, 0].numpy()

@@ -193,11 +193,7 @@ def moving_capture(
 
 
 def _moving_view(
-    lens: LensLike,
-    points: Tensor,
-    hands: Hands,
-    drawn: tuple[float, float, float, float],
-    generator: torch.Generator,
+    lens: LensLike, points: Tensor, hands: Hands, drawn: tuple[float, float, float, float], generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """`rolling_corners` of a picture that is not too blurred, by readout, exposure, rate and speed of a capture."""
     readout, exposure, turning, speed = drawn

@@ -6,11 +6,15 @@ Read the conclusion again whenever a table changes.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from scripts.shared.timing import row
 
+# What a section of a page yields: texts, and the heads and rows of tables (`laid_out`).
+Line = str | Sequence[object]
+Lines = Iterator[Line]
 DOCS = Path(__file__).parents[2] / "docs" / "measured"
 
 
@@ -57,9 +61,28 @@ def merged(
 
 def table(heads: Sequence[object], rows: Iterable[Sequence[object]]) -> Iterator[str]:
     """The lines of a Markdown table, each as soon as its row is there."""
-    yield row(*heads)
-    yield row(*["---"] * len(heads))
-    for cells in rows:
-        if len(cells) != len(heads):
-            raise ValueError(f"{len(cells)} cells below {len(heads)} heads: {cells}")
-        yield row(*cells)
+    return laid_out(itertools.chain([heads], rows))
+
+
+def laid_out(parts: Iterable[Line]) -> Iterator[str]:
+    """Lines of Markdown, each as soon as its part is there: texts as they are, and rows as tables, heads first.
+
+    A text ends a table; an empty line is put between the two.
+    """
+    heads: Sequence[object] | None = None
+    last: object = ""
+    for part in parts:
+        if last and part and isinstance(last, str) != isinstance(part, str):
+            yield ""
+        last = part
+        if isinstance(part, str):
+            heads = None
+            yield part
+        elif heads is None:
+            heads = part
+            yield row(*heads)
+            yield row(*["---"] * len(heads))
+        elif len(part) == len(heads):
+            yield row(*part)
+        else:
+            raise ValueError(f"{len(part)} cells below {len(heads)} heads: {part}")

@@ -49,9 +49,8 @@ class Paper:
         """An image (H, W) uint8 and the true points (N, 2)."""
         width, height = camera.size
         fine = light_of([(self, rotation, translation)], camera, supersample)
-        return expose(fine, width, height, blur, noise, seed, supersample), points_of(
-            self.board, camera, rotation, translation
-        )
+        image = expose(fine, width, height, blur, noise, seed, supersample)
+        return image, points_of(self.board, camera, rotation, translation)
 
 
 def light_of(

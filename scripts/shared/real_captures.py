@@ -18,10 +18,7 @@ from scripts.shared import wide_lens
 from scripts.shared.wide_lens import data_folder
 
 # Folders of images, and their boards. The squares of gloworm960 are not known; no figure depends on them.
-FOLDERS = {
-    "pi640": Board(columns=7, rows=7, square=0.0254),
-    "gloworm960": Board(columns=8, rows=6, square=0.0254),
-}
+FOLDERS = {"pi640": Board(columns=7, rows=7, square=0.0254), "gloworm960": Board(columns=8, rows=6, square=0.0254)}
 CACHE = Path(tempfile.gettempdir(), "kcal-ordinary-corners")
 STEREO_BOARD = Board(columns=9, rows=6, square=0.025)
 
@@ -53,7 +50,7 @@ def load(name: str) -> RealCapture:
         seen, weights = wide_lens.load()
         return RealCapture(seen, torch.from_numpy(weights))
     if name in FOLDERS:
-        seen = _detected(name, lambda: detect(_images(folder / "captures" / name), FOLDERS[name]))
+        seen = _detected(name, lambda: detect(expand_images([str(folder / "captures" / name)]), FOLDERS[name]))
     elif name.startswith("stereo_"):
         seen = _detected(name, lambda: stereo_images(name.removeprefix("stereo_")))
     else:
@@ -61,10 +58,6 @@ def load(name: str) -> RealCapture:
         seen = Observations.load(path if path.exists() else Path(name))
     seen = seen.subset(sorted(seen.names, key=_natural))
     return RealCapture(seen, torch.isfinite(seen.pixels()).all(-1).double())
-
-
-def _images(folder: Path) -> list[Path]:
-    return expand_images([str(folder)])
 
 
 def _detected(name: str, detect: Callable[[], Observations]) -> Observations:
@@ -82,5 +75,5 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 def stereo_images(side: str, refine: Refinement = "erf") -> Observations:
     """OpenCV's own images of the left or the right camera, 13 views of a board of 9x6 corners."""
-    images = [path for path in _images(data_folder() / "opencv_stereo") if path.name.startswith(side)]
-    return detect(images, STEREO_BOARD, refine)
+    images = expand_images([str(data_folder() / "opencv_stereo")])
+    return detect([path for path in images if path.name.startswith(side)], STEREO_BOARD, refine)

@@ -20,7 +20,7 @@ class Section(NamedTuple):
 
     page: str
     name: str
-    make: Callable[..., Iterable[str] | None]
+    make: Callable[..., Iterable[str | Sequence[object]] | None]
     quick: Record
 
     @property
@@ -36,7 +36,8 @@ def section(page: str, name: str, **quick: Any) -> Callable[[Callable[..., Any]]
     """Register a function that makes a section of a page.
 
     Its parameters are options; their defaults tell of which type. One named `write` is told whether pages are written,
-    and one named `kept` keeps draws. It may return None, and lines one by one.
+    and one named `kept` keeps draws. It may return None; else it gives texts, and heads and rows of tables
+    (`scripts.shared.page.laid_out`).
 
     Args:
         page: file in docs/measured.

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal import Board, Camera, KcalError, Observations, View
+from kcal import Board, Camera, KcalError, Observations
 from kcal.calibrate.camera.advice import reached
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.result import CameraCalibrationResult
@@ -22,8 +22,8 @@ from scripts.shared.infinity import error_at_infinity
 from scripts.shared.moving_captures import Hands, MovingCapture, moving_capture
 from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.sections import Record
+from scripts.shared.traced import BOARD, as_observations
 
-BOARD = Board(columns=7, rows=6, square=0.05)
 LENSES = ("webcam", "machine-vision", "surveillance")
 FILL = 0.25, 0.8  # of the image by the board
 # Squared distance that a normal vector of two components exceeds once in twenty times.
@@ -117,19 +117,7 @@ def stretched(pixels: Tensor, covariance: Tensor, size: tuple[int, int], factor:
     height = round(size[1] * factor)
     # The edge of the image stays where it is, half a pixel before the first center.
     corners, spread = (pixels + 0.5) * scale - 0.5, covariance * scale[:, None] * scale
-    views = [view_of(f"{i:03d}", *seen) for i, seen in enumerate(zip(corners, spread, strict=True))]
-    return Observations(board=BOARD, image_size=(size[0], height), views=tuple(views))
-
-
-def view_of(name: str, pixels: Tensor, covariance: Tensor) -> View:
-    """A view from its corners (N, 2), NaN where not seen, and their covariances (N, 2, 2)."""
-    good = pixels.isfinite().all(-1).tolist()
-    spread = covariance.flatten(-2)[:, [0, 1, 3]].tolist()
-    return View(
-        name=name,
-        pixels=tuple((u, v) if ok else None for (u, v), ok in zip(pixels.tolist(), good, strict=True)),
-        covariance=tuple((a, b, c) if ok else None for (a, b, c), ok in zip(spread, good, strict=True)),
-    )
+    return as_observations(corners, (size[0], height), covariance=spread)
 
 
 class Shifted(NamedTuple):
@@ -153,10 +141,10 @@ def against_truth(case: Simulated, options: CalibrationOptions, shifts: Iterable
     try:
         result = calibrate_camera(case.seen, options)
         error = error_at_infinity(result.camera, case.lens)
-        found = told(result) | figures(result, case, error.pixels, error.errors)
+        found = told(result) | figures(result.camera, case.seen, error.pixels, error.errors)
         frames = [error_at_infinity(result.camera, Shifted(case.lens, own)) for own in shifts]  # type: ignore[arg-type]
         if frames:
-            inside = (figures(result, case, frame.pixels, frame.errors)["everywhere"] for frame in frames)
+            inside = (figures(result.camera, case.seen, frame.pixels, frame.errors)["everywhere"] for frame in frames)
             found["frame"] = statistics.fmean(inside)
     except KcalError as refusal:
         return {"refused": str(refusal)}
@@ -192,16 +180,16 @@ def terms(fit: HybridFit) -> list[str]:
     return [name for name, here in found.items() if here]
 
 
-def figures(result: CameraCalibrationResult, case: Simulated, pixels: Tensor, errors: Tensor) -> Record:
+def figures(camera: Camera, seen: Observations | None, pixels: Tensor, errors: Tensor) -> Record:
     """Shares of the image (rows, columns, 2) in which the truth is in the 95 % ellipse, and the RMS that σ predicts."""
     rows, columns = pixels.shape[:2]
-    covariance = pixel_covariance(result.camera, pixels.reshape(-1, 2))
+    covariance = pixel_covariance(camera, pixels.reshape(-1, 2))
     off = errors.reshape(-1, 2)
     good = off.isfinite().all(-1) & covariance.isfinite().all(-1).all(-1)
     eye = torch.eye(2, dtype=torch.float64)
     distance = (off * torch.linalg.solve(torch.where(good[:, None, None], covariance, eye), off)).sum(-1)
     inside = (distance < CHI2)[good]
-    within = reached(case.seen, columns, rows).reshape(-1)[good]
+    within = torch.ones_like(inside) if seen is None else reached(seen, columns, rows).reshape(-1)[good]
     return {
         "inside": float(inside[within].double().mean()),
         "beyond": float(inside[~within].double().mean()),

@@ -78,10 +78,8 @@ class Weather:
         east = -math.cos(declination) * math.sin(turn)
         up = math.sin(latitude) * math.sin(declination) + math.cos(latitude) * math.cos(declination) * math.cos(turn)
         heading = math.radians(_HEADING)
-        across, ahead = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]]) @ (
-            east,
-            north,
-        )
+        turned = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
+        across, ahead = turned @ (east, north)
         return np.array([across, ahead, up])
 
 
@@ -298,20 +296,14 @@ def _pieces(seed: int, weather: Weather, focal: float) -> list[Facet]:
     for distance, top in _HILLS:
         offset, gray = float(random.uniform(0, 99)), float(random.uniform(80, 130))
         outline = box_outline((-2 * distance, -EYE_HEIGHT, 2 * distance, top + 0.1 * distance))
-        hill = facing(
-            np.array([0.0, distance, 0.0]), outline, (gray,), top=_skyline(top, distance, offset)
-        )  # fmt: skip
+        hill = facing(np.array([0.0, distance, 0.0]), outline, (gray,), top=_skyline(top, distance, offset))
         hills.append(_textured(hill, offset, weather, weather.season, focal))
     for distance in np.geomspace(50.0, 2500.0, 48):
         side, width = float(distance * random.uniform(-0.6, 0.6)), float(distance * random.uniform(0.015, 0.05))
         height, offset = float(random.uniform(1.0, 3.0) * width), float(random.uniform(0, 99))
         gray, turn = float(random.uniform(70, 170)), float(random.uniform(-35.0, 35.0))
-        block = facing(
-            np.array([side, float(distance), -EYE_HEIGHT]),
-            box_outline((-width, 0.0, width, height)),
-            (gray,),
-            turn=turn,
-        )
+        foot, outline = np.array([side, float(distance), -EYE_HEIGHT]), box_outline((-width, 0.0, width, height))
+        block = facing(foot, outline, (gray,), turn=turn)
         blocks.append(_textured(block, offset, weather, 0.0, focal))
     shadows = [shadow for block in blocks if (shadow := _shadow(block, weather)) is not None]
     return [ground, *hills, *shadows, *blocks[::-1]]

@@ -15,21 +15,23 @@ import numpy as np
 SHORTEST_S = 0.003
 
 
-def times(calls: Sequence[Callable[[], object]], rounds: int) -> list[list[float]]:
+def times(
+    calls: Sequence[Callable[[], object]], rounds: int, clock: Callable[[], float] = time.perf_counter
+) -> list[list[float]]:
     """Seconds of each call in each round; some runs of each first, not counted, settle how often it is repeated."""
     repeats = []
     for call in calls:
         call()
-        start = time.perf_counter()
+        start = clock()
         call()
-        repeats.append(max(1, math.ceil(SHORTEST_S / max(time.perf_counter() - start, 1e-7))))
+        repeats.append(max(1, math.ceil(SHORTEST_S / max(clock() - start, 1e-7))))
     found: list[list[float]] = [[] for _ in calls]
     for _ in range(rounds):
         for which, call in enumerate(calls):
-            start = time.perf_counter()
+            start = clock()
             for _ in range(repeats[which]):
                 call()
-            found[which].append((time.perf_counter() - start) / repeats[which])
+            found[which].append((clock() - start) / repeats[which])
     return found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,17 +26,9 @@ def printed(points: Tensor, seed: int) -> Tensor:
     return points + PrintedBoard(BOARD.columns, BOARD.rows, BOARD.square, seed).errors(points)
 
 
-def capture(
-    lens: LensLike,
-    views: int,
-    sigma: float,
-    seed: int,
-    points: Tensor = BOARD.points,
-    fill: tuple[float, float] = (0.25, 0.8),
-    posed_by: LensLike | None = None,
-) -> Observations:
-    """Views of a board, whose corners truly are at `points`, by a lens, as an observations file."""
-    return captures(lens, views, [sigma], seed, points, fill, posed_by)[0]
+def capture(lens: LensLike, views: int, sigma: float, seed: int, *more: Any, **options: Any) -> Observations:
+    """Views of a board by a lens, as those of `captures`, which has further options, with noise of one size."""
+    return captures(lens, views, [sigma], seed, *more, **options)[0]
 
 
 def captures(
@@ -47,7 +40,10 @@ def captures(
     fill: tuple[float, float] = (0.25, 0.8),
     posed_by: LensLike | None = None,
 ) -> list[Observations]:
-    """The same views with noise of several sizes, each drawn by itself; `posed_by`: a lens that draws poses sooner."""
+    """Views of a board, whose corners truly are at `points`, with noise of several sizes, each drawn by itself.
+
+    `posed_by` is a lens that draws poses sooner.
+    """
     found = capture_corners(posed_by or lens, views, sigma=1.0, seed=seed, fill=fill)
     seen, valid = lens.project(points @ found.rotation.transpose(-1, -2) + found.translation[:, None])
     # Poses that another lens drew may reach beyond this one's image.
@@ -60,11 +56,22 @@ def captures(
     return out
 
 
-def as_observations(pixels: Tensor, size: tuple[int, int], board: Board = BOARD) -> Observations:
-    """Corners (V, N, 2) of the board, NaN where not seen, as an observations file."""
-    corners = [tuple(None if u != u else (u, v) for u, v in view) for view in pixels.tolist()]
-    views = tuple(View(name=f"{i:03d}", pixels=view) for i, view in enumerate(corners))
-    return Observations(board=board, image_size=size, views=views)
+def as_observations(
+    pixels: Tensor,
+    size: tuple[int, int],
+    board: Board = BOARD,
+    *,
+    covariance: Tensor | None = None,
+    names: Sequence[str] = (),
+) -> Observations:
+    """Corners (V, N, 2) of a board, NaN where not seen, with covariances (V, N, 2, 2) if given, as observations."""
+    spread = [None] * len(pixels) if covariance is None else covariance.flatten(-2)[..., [0, 1, 3]].tolist()
+    views = []
+    for i, (view, own) in enumerate(zip(pixels.tolist(), spread, strict=True)):
+        corners = tuple(None if u != u else (u, v) for u, v in view)
+        known = own and tuple(c and (a, b, d) for c, (a, b, d) in zip(corners, own, strict=True))
+        views.append(View(name=names[i] if names else f"{i:03d}", pixels=corners, covariance=known))
+    return Observations(board=board, image_size=size, views=tuple(views))
 
 
 def as_camera(lens: TruthLens) -> Camera:

@@ -29,9 +29,8 @@ def load() -> tuple[Observations, np.ndarray]:
         pixels = tuple((p[0], p[1]) if w > 0 else None for p, w in zip(points, weights, strict=True))
         covariance = tuple((1 / w**2, 0.0, 1 / w**2) if w > 0 else None for w in weights)
         views.append(View(name=f"{i:03d}", pixels=pixels, covariance=covariance))
-    return Observations(board=board, image_size=(int(size[0]), int(size[1])), views=tuple(views)), np.maximum(
-        weight, 0.0
-    )
+    seen = Observations(board=board, image_size=(int(size[0]), int(size[1])), views=tuple(views))
+    return seen, np.maximum(weight, 0.0)
 
 
 def folds(split: str, views: int) -> list[np.ndarray]:

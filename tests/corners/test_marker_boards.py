@@ -15,8 +15,7 @@ from kcal.corners.marker_boards import _opencv_board, find_aprilgrid, find_charu
 from kcal.corners.markers import marker_cells, opencv_dictionary
 from kcal.corners.print_board import pattern_shapes
 from kcal.corners.search import NotFoundError
-from scripts.bench.hard_boards import covered, cut, moving, noisy, pictures, plain, small
-from scripts.bench.hard_scenes import Marked
+from scripts.bench.hard_boards import Marked, covered, cut, moving, noisy, pictures, plain, small
 from scripts.bench.marked_boards import WRONG
 from scripts.shared.printed_board import Paper, add, errors, expose, light_of, points_of, pose
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from kcal import Camera, InputError, Rig
 from kcal.sim.captures import BoardSize, PoseOptions, board_points, project_board, sample_board_poses
 from kcal.sim.scene import demo_rig
-from scripts.shared.pair_poses import rig_pose, sample_pair_poses
+from scripts.shared.captures import rig_pose, sample_pair_poses
 
 CAMERA = Camera.build(focal=(800, 810), center=(330, 235), size=(640, 480), coefficients=[-0.25, 0.07, 1e-3, -1e-3])
 BOARD = BoardSize(9, 6, 0.025)

@@ -21,8 +21,7 @@ from kcal.locate import enu_from_cam
 from kcal.stars.night import NamedStars, SkyView, name_stars
 from kcal.stars.rig_stars import moments_of, star_source
 from kcal.stars.sky import StarCatalog, pole_in_enu
-from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
-from scripts.shared.star_rigs import LOOKS, star_rig
+from scripts.shared.night_scenes import LOOKS, PLACE, TIME, night_camera, rendered, star_pixels, star_rig
 
 CAMERA = night_camera(1600.0, (1920, 1080))
 STRAIGHT = RigOptions(refraction=0.0, refraction_sigma=0.0)
