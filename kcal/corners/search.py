@@ -183,13 +183,7 @@ def _predicted(grid: Tensor) -> Tensor:
 
 
 def _are_corners(
-    image: npt.NDArray[np.generic],
-    grid: Tensor,
-    places: Tensor,
-    along: Tensor,
-    down: Tensor,
-    new: Tensor,
-    free: float,
+    image: npt.NDArray[np.generic], grid: Tensor, places: Tensor, along: Tensor, down: Tensor, new: Tensor, free: float
 ) -> Tensor:
     """Whether squares alternate on all four sides of new places (N, 2), in step with the corners known in `grid`."""
     known = contrast(image, grid, *(free * step for step in local_steps(grid))) / 2 * checkered(grid)

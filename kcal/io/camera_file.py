@@ -188,10 +188,7 @@ def provenance() -> dict[str, Any]:
         >>> sorted(provenance())
         ['created', 'kcal_version']
     """
-    return {
-        "kcal_version": kcal.__version__,
-        "created": datetime.datetime.now(datetime.UTC).replace(microsecond=0),
-    }
+    return {"kcal_version": kcal.__version__, "created": datetime.datetime.now(datetime.UTC).replace(microsecond=0)}
 
 
 def camera_to_file(

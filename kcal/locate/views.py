@@ -340,11 +340,7 @@ def _height_row(ahead: Tensor, inverse: Tensor, scale: Tensor, stated: StatedHei
 
 
 def shared_pixels(
-    posed: PosedCameras,
-    shared: CommonErrors,
-    at: tuple[Tensor, Tensor, Tensor],
-    used: Tensor,
-    scale: Tensor,
+    posed: PosedCameras, shared: CommonErrors, at: tuple[Tensor, Tensor, Tensor], used: Tensor, scale: Tensor
 ) -> Tensor:
     """(K, 2 C, N) what each shared error moves in the pixels of points: anchor (N, 3), direction, inverse distance."""
     place, ahead, inverse = at
