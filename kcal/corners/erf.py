@@ -9,22 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+import kcal.corners.erf_board as models
 from kcal.checks import as_points
-from kcal.corners.erf_board import (
-    FAR,
-    ODD,
-    PARAMETERS,
-    CornerWindow,
-    LineDistances,
-    RampPrior,
-    crossing,
-    curvatures,
-    cut_windows,
-    light_at,
-    light_slope,
-    line_covariance,
-    neighbor_lines,
-)
 from kcal.corners.grid import Neighbors
 from kcal.corners.saddle import MAX_MOVE, MOVE_SHARE, CornerStatus, Refined, check_arguments, inside_image, with_status
 from kcal.dispatch import is_differentiated
@@ -186,7 +172,7 @@ class CrossingFit(NamedTuple):
 
     center: Tensor
     parameters: Tensor
-    window: CornerWindow
+    window: models.CornerWindow
     noise: Tensor
     covariance: Tensor
     crosses: Tensor
@@ -202,13 +188,13 @@ class CrossingFit(NamedTuple):
 class _FitInputs(NamedTuple):
     """What a fit takes as given: pixels, curvatures of the edges (M, 2), prior, and the next lines."""
 
-    window: CornerWindow
+    window: models.CornerWindow
     bend: Tensor
-    prior: RampPrior
-    lines: LineDistances | None
+    prior: models.RampPrior
+    lines: models.LineDistances | None
 
     def of(self, some: Tensor) -> _FitInputs:
-        lines = None if self.lines is None else LineDistances(*(value[some] for value in self.lines))
+        lines = None if self.lines is None else models.LineDistances(*(value[some] for value in self.lines))
         return _FitInputs(self.window.of(some), self.bend[some], self.prior.of_some(some), lines)
 
 
@@ -229,27 +215,27 @@ def fit_crossings(
     offset = (start - base).reshape(-1, 2)
     flat_side = side.reshape(-1)
     radius = (SHARE * flat_side).clamp(MIN_RADIUS, MAX_RADIUS)
-    window, levels = cut_windows(image, base, offset, radius)
+    window, levels = models.cut_windows(image, base, offset, radius)
     first, crosses = _start(window)
     nothing = torch.zeros_like(first[:, :2])
-    curves = curvatures(bend, first) if bend is not None else nothing
-    prior = RampPrior.of(first, nothing, nothing[:, 0], nothing[:, 0])
+    curves = models.curvatures(bend, first) if bend is not None else nothing
+    prior = models.RampPrior.of(first, nothing, nothing[:, 0], nothing[:, 0])
     # A few steps are enough to estimate the illumination of the board and which lines reach into windows.
     parameters, cost, converged = _levenberg_marquardt(first, _FitInputs(window, curves, prior, None), _FIRST_STEPS)
     usable = crosses & torch.isfinite(cost)
     lines = None
     near = torch.zeros_like(crosses)
     if around is not None:
-        beside = neighbor_lines(around, parameters)
+        beside = models.neighbor_lines(around, parameters)
         blur = parameters[:, 4].exp().clamp(max=0.5 * flat_side)
         near = usable & (beside.distance.amin((-2, -1)) - radius < REACH * blur)
         if bool(near.any()):
             # Markers may leave less than half a square free; the window stays inside that.
             free = flat_side >= 0.95 * torch.linalg.vector_norm(around.step, dim=-1).nan_to_num(math.inf).amin(-1)
             wide = (WIDE_SHARE * flat_side).clamp(MIN_RADIUS, MAX_RADIUS)
-            window, levels = cut_windows(image, base, offset, torch.where(near & free, wide, radius))
+            window, levels = models.cut_windows(image, base, offset, torch.where(near & free, wide, radius))
             lines = beside.distances(parameters, window.where)
-            lines = LineDistances(lines.distance, lines.turn * near[:, None, None, None])
+            lines = models.LineDistances(lines.distance, lines.turn * near[:, None, None, None])
     inputs = _FitInputs(window, curves, prior, lines)
     # With lines each step is twice the work, so only corners near one get them. These are fitted twice, because only
     # the first of the two fits makes the illumination well determined.
@@ -257,10 +243,10 @@ def fit_crossings(
         some = group.nonzero()[:, 0]
         if not len(some):
             continue
-        light = light_at(parameters, window, curves, lines, usable.reshape(side.shape))
+        light = models.light_at(parameters, window, curves, lines, usable.reshape(side.shape))
         place = base + parameters[:, :2].reshape(base.shape)
-        slope, error = light_slope(light, place, side, usable.reshape(side.shape))
-        inputs = inputs._replace(prior=RampPrior.of(parameters, slope, error, cost / window.weight.sum(-1)))
+        slope, error = models.light_slope(light, place, side, usable.reshape(side.shape))
+        inputs = inputs._replace(prior=models.RampPrior.of(parameters, slope, error, cost / window.weight.sum(-1)))
         chosen = (inputs if with_lines else inputs._replace(lines=None)).of(some)
         done = _levenberg_marquardt(parameters[some], chosen, _STEPS)
         parameters, cost, converged = (
@@ -292,7 +278,7 @@ def _levenberg_marquardt(parameters: Tensor, inputs: _FitInputs, steps: int) -> 
     for _ in range(steps):
         scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).rsqrt()
         scaled = normal * scale[:, :, None] * scale[:, None, :]
-        scaled = scaled + (_FLOOR + damping)[:, None, None] * torch.eye(PARAMETERS, device=scaled.device)
+        scaled = scaled + (_FLOOR + damping)[:, None, None] * torch.eye(models.PARAMETERS, device=scaled.device)
         factor, _ = torch.linalg.cholesky_ex(scaled)
         step = -torch.cholesky_solve((gradient * scale)[..., None], factor)[..., 0] * scale
         step = torch.nan_to_num(step, posinf=0.0, neginf=0.0)
@@ -320,7 +306,7 @@ def _levenberg_marquardt(parameters: Tensor, inputs: _FitInputs, steps: int) -> 
     return result, result_cost, result_last < _CONVERGED
 
 
-def _start(window: CornerWindow) -> tuple[Tensor, Tensor]:
+def _start(window: models.CornerWindow) -> tuple[Tensor, Tensor]:
     """Edge directions from the asymptotes of a quadratic, then mean and contrast by linear least squares."""
     x, y = (window.where - window.offset[:, None].to(window.where)).unbind(-1)
     one = torch.ones_like(x)
@@ -333,12 +319,12 @@ def _start(window: CornerWindow) -> tuple[Tensor, Tensor]:
     axis = 0.5 * torch.atan2(xy, 0.5 * (xx - yy))
     # xx cos² + 2 xy cos sin + yy sin² = middle + spread cos(2 (angle - axis)) = 0
     opening = 0.5 * torch.acos((-middle / spread.clamp_min(1e-300)).clamp(-0.9, 0.9))
-    parameters = torch.zeros(len(x), PARAMETERS, dtype=torch.float64, device=x.device)
+    parameters = torch.zeros(len(x), models.PARAMETERS, dtype=torch.float64, device=x.device)
     parameters[:, :2] = window.offset
     parameters[:, 2], parameters[:, 3] = axis - opening, axis + opening
     parameters[:, 4] = (0.2 * window.radius).clamp(0.6, 1.5).log()
     parameters[:, 6] = 1.0
-    levels, _ = crossing(parameters, window.where, torch.zeros_like(parameters[:, :2]), slopes=False)
+    levels, _ = models.crossing(parameters, window.where, torch.zeros_like(parameters[:, :2]), slopes=False)
     design = torch.stack([one, levels], -1)
     parameters[:, 5:7] = _least_squares(design, window.levels, weight)
     return parameters, crosses
@@ -353,7 +339,7 @@ def _least_squares(design: Tensor, values: Tensor, weight: Tensor) -> Tensor:
 def _normal_equations(parameters: Tensor, inputs: _FitInputs) -> tuple[Tensor, Tensor, Tensor]:
     """Normal matrix, gradient and cost of the weighted residuals and the prior."""
     window, prior = inputs.window, inputs.prior
-    levels, jacobian = crossing(parameters, window.where, inputs.bend, inputs.lines)
+    levels, jacobian = models.crossing(parameters, window.where, inputs.bend, inputs.lines)
     weight, miss = prior.diagonal(), parameters - prior.value()
     residual = levels - window.levels
     weighted = jacobian * window.weight[:, None]
@@ -369,19 +355,19 @@ def _noise_and_covariance(
     parameters: Tensor, inputs: _FitInputs, usable: Tensor, least_noise: float
 ) -> tuple[Tensor, Tensor]:
     window, prior = inputs.window, inputs.prior
-    levels, jacobian = crossing(parameters, window.where, inputs.bend, inputs.lines)
+    levels, jacobian = models.crossing(parameters, window.where, inputs.bend, inputs.lines)
     weighted = jacobian * window.weight[:, None]
     normal = (weighted @ jacobian.mT).double() + torch.diag_embed(prior.diagonal())
     inverse, _ = torch.linalg.inv_ex(normal)
     images = usable.shape
     residual = levels - window.levels
-    freedom = (window.weight.sum(-1) - PARAMETERS).clamp_min(1.0)
+    freedom = (window.weight.sum(-1) - models.PARAMETERS).clamp_min(1.0)
     noise = (window.weight * residual.square()).sum(-1) / freedom
     covariance = center_covariance(
         window.patches(residual).unflatten(0, images),
         window.patches(window.weight).unflatten(0, images),
-        window.patches(jacobian[:, ODD]).unflatten(0, images),
-        inverse.reshape(*images, PARAMETERS, PARAMETERS)[:, :, ODD][..., ODD],
+        window.patches(jacobian[:, models.ODD]).unflatten(0, images),
+        inverse.reshape(*images, models.PARAMETERS, models.PARAMETERS)[:, :, models.ODD][..., models.ODD],
         parameters[:, :2].reshape(*images, 2),
         usable & torch.isfinite(inverse).all(-1).all(-1).reshape(images),
         least_noise,
@@ -390,7 +376,9 @@ def _noise_and_covariance(
     covariance = covariance + by_ramp @ by_ramp.transpose(-1, -2)
     if inputs.lines is not None:
         gain = inverse[:, :2].to(weighted) @ weighted
-        covariance = covariance + line_covariance(parameters, window, inputs.bend, inputs.lines, gain, covariance)
+        covariance = covariance + models.line_covariance(
+            parameters, window, inputs.bend, inputs.lines, gain, covariance
+        )
     return noise, covariance
 
 
@@ -398,12 +386,12 @@ def _with_gradient(parameters: Tensor, inputs: _FitInputs, levels: Tensor) -> Te
     """The center as a function of the gray levels: at the minimum g(p, levels) = 0, so dp = -(∂g/∂p)⁻¹ ∂g."""
     window, prior, lines = inputs.window.double(), inputs.prior, inputs.lines
     if lines is None:
-        far = torch.full((len(parameters), 2, 2, 1), FAR, dtype=torch.float64, device=parameters.device)
-        lines = LineDistances(far, torch.zeros_like(far))
+        far = torch.full((len(parameters), 2, 2, 1), models.FAR, dtype=torch.float64, device=parameters.device)
+        lines = models.LineDistances(far, torch.zeros_like(far))
 
     def gradient(parameters: Tensor, *given: Tensor) -> Tensor:
         bend, distance, turn, prior, mean, weight, values = given
-        levels, jacobian = crossing(parameters, window.where, bend, LineDistances(distance, turn))
+        levels, jacobian = models.crossing(parameters, window.where, bend, models.LineDistances(distance, turn))
         return jacobian @ (weight * (levels - values)) + prior * (parameters - mean)
 
     arguments = parameters, inputs.bend, *lines, prior.diagonal(), prior.value(), window.weight

@@ -248,11 +248,6 @@ def camera_to_file(
     return file.model_copy(update={"summary": CameraSummary.made(camera, file.model_dump(mode="json"))})
 
 
-def named_camera_file(camera: Camera, otherwise: str) -> CameraFile:
-    """The file of a camera, with the name `otherwise` if the camera has none."""
-    return camera_to_file(camera, name=(camera.calibration or CameraCalibration()).name or otherwise)
-
-
 def save_camera(camera: Camera, path: str | Path, *, name: str | None = None) -> Path:
     """Write a camera with its error bars and history (`camera.calibration`); `name` replaces the name it has.
 

@@ -16,10 +16,10 @@ from kcal.errors import InputError
 from kcal.lens.rig import Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic
 from kcal.locate.ground import Ground
-from kcal.locate.localizer import Localization, Localizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks
 from kcal.locate.positions import Located
-from kcal.locate.stereo import PositionStatus
+from kcal.locate.stereo import Localization, PositionStatus
 from kcal.locate.tables import CHUNK_ROWS, PositionColumns
 from kcal.locate.tabulate import Geoid, Group, Viewpoint, geoid_column, number_table, viewpoint
 

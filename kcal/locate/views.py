@@ -8,28 +8,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+import kcal.locate.max_likelihood as likely
+import kcal.locate.stereo as stereo
 from kcal.dispatch import known_true
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import project_each, unproject_each
 from kcal.lens.pose import side_axes, step_rows
 from kcal.lens.rig import Rig
 from kcal.locate.angular import Found, Surroundings, first_seen, length_of_one, lifted, triangulate_angular
-from kcal.locate.max_likelihood import (
-    PointFit,
-    RelativeCamera,
-    inverse_covariances,
-    most_likely,
-    position_slope,
-    symmetric,
-)
-from kcal.locate.stereo import (
-    BEARING_SIGMAS,
-    PositionStatus,
-    flag_positions,
-    joint_covariance,
-    range_interval,
-    sight_lines,
-)
 from kcal.texts import briefly
 
 # Pixels of any subset of cameras to points with errors, each point on its own.
@@ -137,7 +123,7 @@ class ViewsFit(NamedTuple):
         alone: (N,) points that one camera and a stated height determine, whose error bars carry no gradient; or None.
     """
 
-    fit: PointFit
+    fit: likely.PointFit
     scale: Tensor
     anchor: Tensor
     place: Tensor
@@ -156,8 +142,8 @@ class ViewsFit(NamedTuple):
 
     def covariance(self, ok: Tensor) -> Tensor:
         """(N, 3, 3) of the points; an infinite diagonal unless `ok`."""
-        slope = position_slope(self.fit, self.scale, ok)
-        found = self.steady(self.variance * (slope @ symmetric(self.fit.covariance) @ slope.mT))
+        slope = likely.position_slope(self.fit, self.scale, ok)
+        found = self.steady(self.variance * (slope @ likely.symmetric(self.fit.covariance) @ slope.mT))
         return torch.where(ok[..., None, None], found, torch.diag(found.new_full((3,), torch.inf)))
 
     def steady(self, values: Tensor) -> Tensor:
@@ -268,18 +254,18 @@ def fit_views(
     with torch.set_grad_enabled(differentiated and shared is not None):
         inside = posed.inside(pixels)
         used = wanted & valid & inside & sound
-        code = torch.full(used.shape[:-1], int(PositionStatus.OK), dtype=torch.int8, device=used.device)
+        code = torch.full(used.shape[:-1], int(stereo.PositionStatus.OK), dtype=torch.int8, device=used.device)
         count = used.sum(-1)
         nothing = count == 0
         for condition, status in (
-            (count == 1, PositionStatus.BEARING_ONLY),
-            (nothing & ~seen.any(-1), PositionStatus.MASKED),
-            (nothing & (seen & ~finite).any(-1), PositionStatus.NOT_FINITE),
-            (nothing & (wanted & ~inside).any(-1), PositionStatus.OUTSIDE_IMAGE),
-            (nothing & (wanted & inside & ~valid).any(-1), PositionStatus.OUTSIDE_LENS),
-            ((wanted & ~sound).any(-1), PositionStatus.BAD_COVARIANCE),
+            (count == 1, stereo.PositionStatus.BEARING_ONLY),
+            (nothing & ~seen.any(-1), stereo.PositionStatus.MASKED),
+            (nothing & (seen & ~finite).any(-1), stereo.PositionStatus.NOT_FINITE),
+            (nothing & (wanted & ~inside).any(-1), stereo.PositionStatus.OUTSIDE_IMAGE),
+            (nothing & (wanted & inside & ~valid).any(-1), stereo.PositionStatus.OUTSIDE_LENS),
+            ((wanted & ~sound).any(-1), stereo.PositionStatus.BAD_COVARIANCE),
         ):
-            code = flag_positions(code, condition, status)
+            code = stereo.flag_positions(code, condition, status)
         anchor = first_seen(used)
         anchor = torch.cat([anchor[..., :1] | nothing[..., None], anchor[..., 1:]], -1)
         ray = (anchor[..., None] * in_frame).sum(-2)
@@ -295,7 +281,7 @@ def fit_views(
             stated = height(place, ray, anchor, count == 1)
             alone = (count == 1) & stated.reached
             away, met = torch.where(alone[..., None], stated.point - place, away), met | alone
-            code = flag_positions(code, alone, PositionStatus.OK)
+            code = stereo.flag_positions(code, alone, stereo.PositionStatus.OK)
         away = torch.where(met[..., None], away, ray)
         distance = torch.linalg.vector_norm(away, dim=-1)
         ahead, inverse = away / distance[..., None], torch.where(met, scale / distance, 0.0)
@@ -304,7 +290,7 @@ def fit_views(
         held = torch.where(alone[..., None, :], _height_row(ahead.detach(), inverse.detach(), scale, stated), 0.0)
         off = ((place - place.detach()) * stated.up).sum(-1) + stated.off
         around = around._replace(held=held, held_off=torch.where(alone, off / stated.sigma, 0.0))
-    fitted = code == int(PositionStatus.OK)
+    fitted = code == int(stereo.PositionStatus.OK)
     weight: Tensor | None = None
     variance: Tensor | float = noise**2
     if cov is not None or shared is not None:
@@ -312,10 +298,10 @@ def fit_views(
         weight, variance = _weight(cov, noise, used, moved), 1.0
     apart = place[..., None, :] - center
     lines = [
-        RelativeCamera(camera, turn, turn @ apart[..., c, :].mT)
+        likely.RelativeCamera(camera, turn, turn @ apart[..., c, :].mT)
         for c, (camera, turn) in enumerate(zip(posed.cameras, posed.rotation, strict=True))
     ]
-    fit = most_likely(
+    fit = likely.most_likely(
         lines, scale, (ahead, inverse), pixels.flatten(-2).mT, fitted, weight, differentiated=differentiated,
         around=around,
     )  # fmt: skip
@@ -382,11 +368,11 @@ def _weight(cov: Tensor | None, noise: Tensor | float, used: Tensor, moved: Tens
     """(2 C, 2 C, N) inverse covariance of the pixels of used views; the identity for the others."""
     still = torch.eye(2, dtype=torch.float64, device=used.device)
     own = noise**2 * still if cov is None else cov
-    whole = joint_covariance(torch.where(used[..., None, None], own, still))
+    whole = stereo.joint_covariance(torch.where(used[..., None, None], own, still))
     if moved is not None:
         each = moved.movedim(-1, 0)  # (N, K, 2 C)
         whole = whole + each.mT @ each
-    weight, _ = inverse_covariances(whole)
+    weight, _ = likely.inverse_covariances(whole)
     assert weight is not None
     return weight
 
@@ -422,28 +408,28 @@ def fit_pairs(
         left = torch.where(wanted[..., None], left, rig.left.center.detach())
         right = torch.where(wanted[..., None], right, rig.right.center.detach())
     with torch.no_grad():
-        lines = sight_lines(rig, left, right)
-        weight, sound = inverse_covariances(cov)
-        code = flag_positions(lines.status, ~sound, PositionStatus.BAD_COVARIANCE)
-        code = flag_positions(code, ~finite, PositionStatus.NOT_FINITE)
+        lines = stereo.sight_lines(rig, left, right)
+        weight, sound = likely.inverse_covariances(cov)
+        code = stereo.flag_positions(lines.status, ~sound, stereo.PositionStatus.BAD_COVARIANCE)
+        code = stereo.flag_positions(code, ~finite, stereo.PositionStatus.NOT_FINITE)
         if mask is not None:
-            code = flag_positions(code, ~mask, PositionStatus.MASKED)
-        met = code == int(PositionStatus.OK)
-        usable = met | ((code == int(PositionStatus.PARALLEL)) & ~lines.along_baseline)
+            code = stereo.flag_positions(code, ~mask, stereo.PositionStatus.MASKED)
+        met = code == int(stereo.PositionStatus.OK)
+        usable = met | ((code == int(stereo.PositionStatus.PARALLEL)) & ~lines.along_baseline)
         scale = rig.baseline.detach()
         distance = torch.where(met, torch.linalg.vector_norm(lines.points, dim=-1), 1.0)
         ahead = torch.where(met[..., None], lines.points / distance[..., None], lines.rays[..., 0, :])
         start = torch.where(met, scale / distance, 0.0)
     if differentiated and cov is not None:
-        weight, _ = inverse_covariances(cov)
+        weight, _ = likely.inverse_covariances(cov)
     rotation, translation = rig.right_from_left_rotation, rig.right_from_left_translation
     still = torch.eye(3, dtype=torch.float64, device=rotation.device)
     cameras = (
-        RelativeCamera(rig.left, still, torch.zeros_like(translation)),
-        RelativeCamera(rig.right, rotation, translation),
+        likely.RelativeCamera(rig.left, still, torch.zeros_like(translation)),
+        likely.RelativeCamera(rig.right, rotation, translation),
     )
     pixels = torch.cat([left, right], -1).mT
-    fit = most_likely(
+    fit = likely.most_likely(
         cameras, scale, (ahead, start), pixels, usable, weight, by_camera=by_camera, differentiated=differentiated
     )
     used = usable[..., None].expand(*usable.shape, 2)
@@ -477,16 +463,18 @@ def reach_of(found: ViewsFit, variance: Tensor, behind: Tensor | None = None) ->
     sigma = torch.sqrt(torch.where(known, variance, 1.0)) / unit
     sigma = found.steady(torch.where(known, sigma, 0.0))
     with torch.no_grad():
-        weak = usable & (~known | (value < BEARING_SIGMAS * sigma))
+        weak = usable & (~known | (value < stereo.BEARING_SIGMAS * sigma))
         lost = usable & ~(value > 0)
-        code = flag_positions(code, weak & (code == int(PositionStatus.OK)), PositionStatus.BEARING_ONLY)
+        code = stereo.flag_positions(
+            code, weak & (code == int(stereo.PositionStatus.OK)), stereo.PositionStatus.BEARING_ONLY
+        )
         if behind is not None:
-            code = flag_positions(code, behind, PositionStatus.BEHIND)
-        code = flag_positions(code, lost, PositionStatus.PARALLEL)
+            code = stereo.flag_positions(code, behind, stereo.PositionStatus.BEHIND)
+        code = stereo.flag_positions(code, lost, stereo.PositionStatus.PARALLEL)
         # What the closed form put at infinity may have come back in front of the rig.
         back = usable & ~lost & ~weak
-        code = flag_positions(code, back if behind is None else back & ~behind, PositionStatus.OK)
-    low, high = map(found.steady, range_interval(value, sigma, known))
+        code = stereo.flag_positions(code, back if behind is None else back & ~behind, stereo.PositionStatus.OK)
+    low, high = map(found.steady, stereo.range_interval(value, sigma, known))
     return Reach(value, sigma, low, high, code)
 
 

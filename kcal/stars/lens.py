@@ -12,6 +12,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+import kcal.stars.lens_fit as fits
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.evidence import Amplitudes
 from kcal.calibrate.hybrid.families import PriorFamilies, typical_hyperprior
@@ -27,17 +28,6 @@ from kcal.lens.camera import Camera
 from kcal.lens.information import LENS_SLOT, CameraInformation
 from kcal.solve.lm import LMOptions, minimize
 from kcal.stars.detect import DetectedStars
-from kcal.stars.lens_fit import (
-    CUT,
-    StarField,
-    StarLens,
-    StarViews,
-    fit_star_lens,
-    lens_rows,
-    require_stars,
-    star_lens,
-    star_state,
-)
 from kcal.stars.night import SkyView, fit_attitude
 from kcal.stars.sky import Identification, StarCatalog, celestial_directions, identify, turn_between
 from kcal.texts import brief
@@ -90,8 +80,8 @@ class Agreement(NamedTuple):
 
 
 def refine_by_stars(
-    fields: Sequence[StarField], rotations: Sequence[Tensor], boards: CameraCalibrationResult
-) -> tuple[StarLens, Agreement]:
+    fields: Sequence[fits.StarField], rotations: Sequence[Tensor], boards: CameraCalibrationResult
+) -> tuple[fits.StarLens, Agreement]:
     """The posterior of a camera from boards and from the named stars of several images of it.
 
     The amplitudes of the default lens are those of largest evidence of both together.
@@ -104,7 +94,7 @@ def refine_by_stars(
     Raises:
         InputError: too few stars, or boards that do not say what they know of the camera.
     """
-    require_stars(fields)
+    fits.require_stars(fields)
     whole = boards.information
     if whole is None:
         raise InputError("the boards do not say how well they know the camera, so that stars cannot refine it")
@@ -112,8 +102,8 @@ def refine_by_stars(
     free = [(index, slot) for index, slot in enumerate(lens.slots) if slot >= 0]
     unknowns = FreeParameters(*zip(*free, strict=True))
     index = torch.tensor(unknowns.leading)
-    stars, model = StarViews.of(fields), boards.camera.model
-    state = star_state(boards.camera.params.detach(), rotations)
+    stars, model = fits.StarViews.of(fields), boards.camera.model
+    state = fits.star_state(boards.camera.params.detach(), rotations)
     stars, sigma = stars.near(model, state, _FIRST_CUT), lens.sigma
 
     def solved(state: BoardState) -> tuple[BoardProblem, BoardState]:
@@ -126,20 +116,20 @@ def refine_by_stars(
     else:
         for _ in range(_ROUNDS):
             _, state = solved(state)
-            stars = stars.near(model, state, CUT)
+            stars = stars.near(model, state, fits.CUT)
     problem, state = solved(state)
-    told = lens_rows(problem, state, stars.noise)
+    told = fits.lens_rows(problem, state, stars.noise)
     change = state.parameters[index] - lens.estimate
     refined = Camera(state.parameters, size=boards.camera.size, model=model)
     wide = dataclasses.replace(whole, sigma=torch.cat([sigma, whole.sigma[len(sigma) :]]))
     # As they count.
     stars = stars._replace(variance=stars.noise**2)
-    found = star_lens(stars, state, refined, told[:, :-1], _with_star_rows(wide, told, change))
+    found = fits.star_lens(stars, state, refined, told[:, :-1], _with_star_rows(wide, told, change))
     return found, _agreement_with(told, change, lens, *_star_noise(stars))
 
 
 def joint_calibration(
-    boards: CameraCalibrationResult, found: StarLens, agreement: Agreement
+    boards: CameraCalibrationResult, found: fits.StarLens, agreement: Agreement
 ) -> CameraCalibrationResult:
     """The calibration by boards with camera, error bars and doubts of both; residuals stay those of boards alone.
 
@@ -170,8 +160,8 @@ def _known_lens(lens: CameraInformation, sigma: Tensor) -> Gaussian:
 
 
 def _by_evidence(
-    hybrid: HybridFit, lens: CameraInformation, index: Tensor, stars: StarViews, state: BoardState
-) -> tuple[Tensor, StarViews, BoardState]:
+    hybrid: HybridFit, lens: CameraInformation, index: Tensor, stars: fits.StarViews, state: BoardState
+) -> tuple[Tensor, fits.StarViews, BoardState]:
     """Set amplitudes by the evidence of boards and stars together.
 
     Args:
@@ -201,7 +191,7 @@ def _by_evidence(
 
     def near(capture: FittedViews, estimate: Estimate) -> FittedViews:
         nonlocal stars
-        stars = stars.near(hybrid.model, estimate.state, CUT)
+        stars = stars.near(hybrid.model, estimate.state, fits.CUT)
         return dataclasses.replace(capture, weights=stars.weights / stars.noise)
 
     estimate = Estimate(hybrid.model, families, state, Amplitudes(hybrid.hyperparameters, 1.0))
@@ -228,7 +218,7 @@ def _with_star_rows(known: CameraInformation, stars: Tensor, change: Tensor) -> 
     return moved.with_data(known.data + Gaussian(known.lens, lens, stars))
 
 
-def _star_noise(stars: StarViews) -> tuple[int, float]:
+def _star_noise(stars: fits.StarViews) -> tuple[int, float]:
     """How many residuals of stars there are, and their sigma in px, as it counts."""
     count = int((stars.weights > 0).sum())
     return 2 * count, stars.noise * math.sqrt(count / float(stars.weights.square().sum()))
@@ -289,7 +279,7 @@ class StarCamera:
 
     __repr__ = brief
 
-    lens: StarLens
+    lens: fits.StarLens
     images: tuple[int, ...]
     stars: tuple[np.ndarray, ...]
     pixels: tuple[np.ndarray, ...]
@@ -354,13 +344,13 @@ def calibrate_by_stars(
     progress("names")
     if not rotations:
         raise InputError(f"in none of {len(images)} images stars have names by the boards' camera: is it of this lens?")
-    lens: StarLens | None = None
+    lens: fits.StarLens | None = None
     agreement: Agreement | None = None
     for _ in range(3):
         seen = _star_fields(images, views, camera, rotations, catalog)
         fields, turns = [one.field for one in seen.values()], [one.rotation for one in seen.values()]
         if boards is None:
-            lens = fit_star_lens(fields, turns, size, float(camera.params[0]))
+            lens = fits.fit_star_lens(fields, turns, size, float(camera.params[0]))
         else:
             lens, agreement = refine_by_stars(fields, turns, boards)
         camera = lens.camera
@@ -477,7 +467,7 @@ def _from_middle_outward(
         near = {n: _near_middle(images[n], size, share) for n in rotations}
         seen = _star_fields(near, views, camera, rotations, catalog)
         fields, turns = [one.field for one in seen.values()], [one.rotation for one in seen.values()]
-        lens = fit_star_lens(fields, turns, size, float(camera.params[0]))
+        lens = fits.fit_star_lens(fields, turns, size, float(camera.params[0]))
         camera = lens.camera
         rotations = {n: found.numpy() for n, found in zip(seen, lens.rotations, strict=True)}
     return camera, rotations
@@ -492,7 +482,7 @@ def _near_middle(found: DetectedStars, size: tuple[int, int], share: float) -> D
 class _StarImage(NamedTuple):
     """The named stars of an image, their numbers (N,) in the catalog, and the rotation from the stars' frame."""
 
-    field: StarField
+    field: fits.StarField
     star: np.ndarray
     rotation: Tensor
 
@@ -515,7 +505,7 @@ def _star_fields(
             continue
         use = best.star >= 0
         parts = directions[best.star[use]], found.pixels[use], found.sigma[use]
-        seen[number] = _StarImage(StarField(*map(torch.from_numpy, parts)), best.star[use], best.rotation)
+        seen[number] = _StarImage(fits.StarField(*map(torch.from_numpy, parts)), best.star[use], best.rotation)
     return seen
 
 
