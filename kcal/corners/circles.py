@@ -110,14 +110,9 @@ def fit_ellipses(image: npt.NDArray[np.generic], center: Tensor, shape: Tensor, 
     scaled = normal / (unit[:, :, None] * unit[:, None, :]) + 1e-12 * torch.eye(PARAMETERS, dtype=torch.float64)
     covariance = torch.linalg.inv(scaled)[:, :2, :2] / (unit[:, :2, None] * unit[:, None, :2]) * noise[:, None, None]
     return Ellipses(
-        center + p[:, :2],
-        _shape(p),
-        covariance,
-        p[:, 7],
-        p[:, 6],
-        noise.sqrt() / p[:, 6].abs().clamp_min(1e-9),
+        center + p[:, :2], _shape(p), covariance, p[:, 7], p[:, 6], noise.sqrt() / p[:, 6].abs().clamp_min(1e-9),
         step < _CONVERGED,
-    )
+    )  # fmt: skip
 
 
 def _shape(p: Tensor) -> Tensor:

@@ -534,12 +534,9 @@ def image_and_hash(source: Any) -> tuple[Any, str | None]:
 
 
 def _renumbered(
-    views: Sequence[View],
-    sources: dict[str, Any],
-    numberings: dict[bool | None, list[str]],
-    board: Board,
+    views: Sequence[View], sources: dict[str, Any], numberings: dict[bool | None, list[str]], board: Board,
     refine: Refinement,
-) -> list[View]:
+) -> list[View]:  # fmt: skip
     """Views of a ChArUco board of the old numbering: images that do not tell it are read anew, as the others tell.
 
     Raises:

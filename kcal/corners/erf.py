@@ -33,14 +33,9 @@ _SHARED_PIXELS = 40.0
 
 
 def center_covariance(
-    residual: Tensor,
-    weight: Tensor,
-    jacobian: Tensor,
-    inverse: Tensor,
-    center: Tensor,
-    usable: Tensor,
+    residual: Tensor, weight: Tensor, jacobian: Tensor, inverse: Tensor, center: Tensor, usable: Tensor,
     least_noise: float,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """The covariance of the first two parameters, the corner's position.
 
     The parameters' error is G noise with G = H⁻¹ JᵀW, and its covariance G R Gᵀ, where R is the covariance of the noise
@@ -364,14 +359,12 @@ def _noise_and_covariance(
     freedom = (window.weight.sum(-1) - models.PARAMETERS).clamp_min(1.0)
     noise = (window.weight * residual.square()).sum(-1) / freedom
     covariance = center_covariance(
-        window.patches(residual).unflatten(0, images),
-        window.patches(window.weight).unflatten(0, images),
+        window.patches(residual).unflatten(0, images), window.patches(window.weight).unflatten(0, images),
         window.patches(jacobian[:, models.ODD]).unflatten(0, images),
         inverse.reshape(*images, models.PARAMETERS, models.PARAMETERS)[:, :, models.ODD][..., models.ODD],
-        parameters[:, :2].reshape(*images, 2),
-        usable & torch.isfinite(inverse).all(-1).all(-1).reshape(images),
+        parameters[:, :2].reshape(*images, 2), usable & torch.isfinite(inverse).all(-1).all(-1).reshape(images),
         least_noise,
-    ).reshape(-1, 2, 2)
+    ).reshape(-1, 2, 2)  # fmt: skip
     by_ramp = inverse[:, :2, 7:9] * (prior.weight * prior.error)[:, None, None]
     covariance = covariance + by_ramp @ by_ramp.transpose(-1, -2)
     if inputs.lines is not None:

@@ -185,14 +185,9 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
 
 
 def read_markers(
-    image: npt.NDArray[np.uint8],
-    board: Board,
-    dictionary: str,
-    border: int = 1,
-    correction: float = 0.6,
-    *,
+    image: npt.NDArray[np.uint8], board: Board, dictionary: str, border: int = 1, correction: float = 0.6, *,
     others: bool = False,
-) -> dict[int, list[npt.NDArray[np.float64]]]:
+) -> dict[int, list[npt.NDArray[np.float64]]]:  # fmt: skip
     """The board's markers by number.
 
     Args:

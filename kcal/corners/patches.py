@@ -340,16 +340,9 @@ def _balance(patches: _Patches, theta: Tensor, scale: Tensor) -> Tensor:
 
 
 def fit_shifts(
-    template: Tensor,
-    right: ImageWindows,
-    moved: Tensor,
-    slopes: Tensor,
-    weight: Tensor,
-    wanted: Tensor,
-    *,
-    robust: bool = True,
-    sheared: bool = False,
-) -> ShiftFit:
+    template: Tensor, right: ImageWindows, moved: Tensor, slopes: Tensor, weight: Tensor, wanted: Tensor, *,
+    robust: bool = True, sheared: bool = False,
+) -> ShiftFit:  # fmt: skip
     """Fit right(moved + slopes shift) = gain template + offset.
 
     Args:

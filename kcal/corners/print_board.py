@@ -352,13 +352,10 @@ def board_sheet(board: Board, page: str = "auto") -> Sheet:
     left, top = _margins(board, pattern, page_wide, page_high)
     ruler, texts = _foot(board, page_wide, page_high)
     drawing = Drawing(
-        width=page_wide,
-        height=page_high,
-        title=f"Board {board}",
+        width=page_wide, height=page_high, title=f"Board {board}",
         rectangles=tuple(r._replace(x=left + r.x, y=top + r.y) for r in pattern.rectangles) + ruler,
-        circles=tuple(c._replace(x=left + c.x, y=top + c.y) for c in pattern.circles),
-        texts=texts,
-    )
+        circles=tuple(c._replace(x=left + c.x, y=top + c.y) for c in pattern.circles), texts=texts,
+    )  # fmt: skip
     origin = (left + pattern.origin[0], top + pattern.origin[1])
     return Sheet(drawing, name, min(left, top) / pattern.margin, pattern.margin, origin)
 

@@ -375,14 +375,10 @@ def board_of_most(images: Sequence[SeenBoard | None]) -> Recognized:
     clear = own > 2 * others and (len(most) > 1 or len(images) <= 2)
     plain = [len(group) for (kind, *_), group in groups.items() if kind not in ("charuco", "aprilgrid")]
     return Recognized(
-        seen=wholes[most[0].vote] if most and clear else None,
-        votes=len(most),
-        sure=sum(one.sure for one in most),
-        looked=len(images),
-        shown=Counter({whole.text: len(groups[vote]) for vote, whole in wholes.items()}),
-        agreed=own >= _LEAD and own >= 3 * others,
-        without_markers=sum(plain) >= _WITHOUT_MARKERS,
-    )
+        seen=wholes[most[0].vote] if most and clear else None, votes=len(most), sure=sum(one.sure for one in most),
+        looked=len(images), shown=Counter({whole.text: len(groups[vote]) for vote, whole in wholes.items()}),
+        agreed=own >= _LEAD and own >= 3 * others, without_markers=sum(plain) >= _WITHOUT_MARKERS,
+    )  # fmt: skip
 
 
 def _together(group: Sequence[SeenBoard]) -> SeenBoard:

@@ -171,13 +171,9 @@ class RefineCorners(nn.Module):
 
 
 def _of_one_image(
-    light: Tensor,
-    start: Tensor,
-    side: Tensor,
-    method: str,
-    grid: tuple[int, int] | None,
+    light: Tensor, start: Tensor, side: Tensor, method: str, grid: tuple[int, int] | None,
     levels: tuple[float, float] | None,
-) -> saddles.Refined:
+) -> saddles.Refined:  # fmt: skip
     """Refine the corners of one image (H, W): by the saddle alone, or by the erf fit from there.
 
     Where the saddle failed, its reason stays, unless it is saturation.

@@ -165,13 +165,11 @@ class CameraFile(NativeFile):
         stated = (self.standard_deviations, self.covariance, self.information, self.calibration, self.setting)
         if self.name or any(stated):
             camera.calibration = CameraCalibration(
-                name=self.name,
-                sigma=self.standard_deviations,
+                name=self.name, sigma=self.standard_deviations,
                 covariance=None if self.covariance is None else self.covariance.expand(camera.names),
                 information=None if self.information is None else self.information.information(self._values()),
-                record=self.calibration,
-                setting=self.setting,
-            )
+                record=self.calibration, setting=self.setting,
+            )  # fmt: skip
         return camera
 
 

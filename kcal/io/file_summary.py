@@ -57,14 +57,10 @@ class CameraSummary(Record):
 
         record = camera.calibration.record if camera.calibration else None
         return cls(
-            of=digest(content),
-            model=str(camera.model),
-            board=None if record is None else str(record.board),
-            focal_length=str(paraxial_focal(camera)),
-            covers_image=bool(camera.covers_image()),
-            sigma=sigma_of(camera),
+            of=digest(content), model=str(camera.model), board=None if record is None else str(record.board),
+            focal_length=str(paraxial_focal(camera)), covers_image=bool(camera.covers_image()), sigma=sigma_of(camera),
             sigma_px=sigma_over_image(camera),
-        )
+        )  # fmt: skip
 
 
 def sigma_of(camera: Camera) -> dict[str, float | None]:

@@ -190,13 +190,9 @@ def quaternion_of(rotation: Tensor) -> list[float]:
 
 
 def named_camera(
-    name: str,
-    intrinsics: Sequence[float],
-    size: Sequence[int],
-    model: LensModel | str,
-    coefficients: Sequence[float] = (),
-    skew: float = 0.0,
-) -> Camera:
+    name: str, intrinsics: Sequence[float], size: Sequence[int], model: LensModel | str,
+    coefficients: Sequence[float] = (), skew: float = 0.0,
+) -> Camera:  # fmt: skip
     """A camera from fx, fy, cx, cy in kcal's convention."""
     fx, fy, cx, cy = map(float, intrinsics)
     width, height = check_pixel_count((int(size[0]), int(size[1])))

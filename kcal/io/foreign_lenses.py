@@ -236,14 +236,9 @@ _FAR = 0.5
 
 
 def foreign_camera(
-    kind: str,
-    name: str,
-    core: Sequence[float],
-    size: Sequence[int],
-    own: Sequence[float],
-    notes: list[str],
+    kind: str, name: str, core: Sequence[float], size: Sequence[int], own: Sequence[float], notes: list[str],
     skew: float = 0.0,
-) -> Camera:
+) -> Camera:  # fmt: skip
     """The camera of a lens: of a model of kcal, or the hybrid camera that comes nearest to it over the image.
 
     Args:

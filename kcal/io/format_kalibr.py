@@ -59,12 +59,10 @@ def read_kalibr(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     for name in parts:
         notes += parts[name].rest(f"{name}.") if name not in unread else []
     return foreign.ImportedCameras(
-        format="kalibr",
-        cameras=cameras,
+        format="kalibr", cameras=cameras,
         poses=tuple(pose for name, pose in poses.items() if name not in unread) if len(poses) > 1 else (),
-        notes=tuple(dict.fromkeys(notes)),
-        unread=unread,
-    )
+        notes=tuple(dict.fromkeys(notes)), unread=unread,
+    )  # fmt: skip
 
 
 def _transform(part: Mapping[str, Any], key: str, name: str) -> np.ndarray:
@@ -126,14 +124,11 @@ def write_kalibr(cameras: Sequence[Camera | ForeignCamera], poses: Sequence[Pose
         _, kind, (fu, fv, pu, pv, _, *own) = as_written(camera)
         model, count, lens = KALIBR_LENSES.get(kind) or ("pinhole", 0, names[kind] if own else "radtan")
         part: dict[str, Any] = {
-            "cam_overlaps": [k for k in range(len(cameras)) if k != i],
-            "camera_model": model,
-            "distortion_coeffs": own[count:] or [0.0] * 4,
-            "distortion_model": lens,
-            "intrinsics": [*own[:count], fu, fv, pu, pv],
-            "resolution": list(camera.size),
+            "cam_overlaps": [k for k in range(len(cameras)) if k != i], "camera_model": model,
+            "distortion_coeffs": own[count:] or [0.0] * 4, "distortion_model": lens,
+            "intrinsics": [*own[:count], fu, fv, pu, pv], "resolution": list(camera.size),
             "rostopic": f"/cam{i}/image_raw",
-        }
+        }  # fmt: skip
         if i and poses:
             step = poses[i].after(poses[i - 1].inverse())
             whole = np.eye(4)

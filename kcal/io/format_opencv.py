@@ -166,15 +166,10 @@ def write_ros(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> l
     for (size, kind, matrices), camera, target in zip(ros_values(cameras, poses), cameras, paths, strict=True):
         blocks = [{"rows": len(one), "cols": one.shape[1], "data": one.ravel().tolist()} for one in matrices]
         content: dict[str, Any] = {
-            "image_width": size[0],
-            "image_height": size[1],
-            "camera_name": camera_name(camera, target.stem),
-            "camera_matrix": blocks[0],
-            "distortion_model": kind,
-            "distortion_coefficients": blocks[1],
-            "rectification_matrix": blocks[2],
-            "projection_matrix": blocks[3],
-        }
+            "image_width": size[0], "image_height": size[1], "camera_name": camera_name(camera, target.stem),
+            "camera_matrix": blocks[0], "distortion_model": kind, "distortion_coefficients": blocks[1],
+            "rectification_matrix": blocks[2], "projection_matrix": blocks[3],
+        }  # fmt: skip
         write_atomic(target, dump_yaml(content))
     return paths
 
@@ -490,10 +485,7 @@ def _struct(camera: Camera) -> dict[str, Any]:
     lens = dict(zip(camera.model.names, camera.coefficients.tolist(), strict=True))
     radial = [lens.get(name, 0.0) for name in (("k1", "k2", "k3") if "k3" in lens else ("k1", "k2"))]
     return {
-        "K": matrix,
-        "IntrinsicMatrix": matrix.T,
-        "RadialDistortion": np.array([radial]),
+        "K": matrix, "IntrinsicMatrix": matrix.T, "RadialDistortion": np.array([radial]),
         "TangentialDistortion": np.array([[lens.get("p1", 0.0), lens.get("p2", 0.0)]]),
-        "ImageSize": np.array([camera.size[::-1]], dtype=float),
-        "WorldUnits": "mm",
-    }
+        "ImageSize": np.array([camera.size[::-1]], dtype=float), "WorldUnits": "mm",
+    }  # fmt: skip

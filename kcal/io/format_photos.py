@@ -419,16 +419,9 @@ def write_nerfstudio(cameras: Sequence[Camera], poses: Sequence[Pose], path: Pat
     fx, fy, cx, cy = camera.params[:4].tolist()
     lens = dict(zip(camera.model.names, camera.coefficients.tolist(), strict=True))
     content: dict[str, Any] = {
-        "w": camera.size[0],
-        "h": camera.size[1],
-        "fl_x": fx,
-        "fl_y": fy,
-        "cx": cx + _HALF,
-        "cy": cy + _HALF,
-        "camera_model": "OPENCV_FISHEYE" if camera.model.fisheye else "OPENCV",
-        **lens,
-        "frames": [],
-    }
+        "w": camera.size[0], "h": camera.size[1], "fl_x": fx, "fl_y": fy, "cx": cx + _HALF, "cy": cy + _HALF,
+        "camera_model": "OPENCV_FISHEYE" if camera.model.fisheye else "OPENCV", **lens, "frames": [],
+    }  # fmt: skip
     return [write_atomic(path, dump_json(content))]
 
 
@@ -489,15 +482,10 @@ def write_opensfm(cameras: Sequence[Camera | ForeignCamera], poses: Sequence[Pos
         kind = {"fisheye4": "fisheye_opencv", "fisheye624": "fisheye624"}.get(model, "brown")
         lens = dict(zip(_OPENSFM_LENSES[kind][0], values, strict=False))
         content[name] = {
-            "projection_type": kind,
-            "width": width,
-            "height": height,
-            "focal_x": fx / longer,
-            "focal_y": fy / longer,
-            "c_x": (cx - 0.5 * (width - 1)) / longer,
-            "c_y": (cy - 0.5 * (height - 1)) / longer,
+            "projection_type": kind, "width": width, "height": height, "focal_x": fx / longer, "focal_y": fy / longer,
+            "c_x": (cx - 0.5 * (width - 1)) / longer, "c_y": (cy - 0.5 * (height - 1)) / longer,
             **{key: lens.get(key, 0.0) for key in _OPENSFM_LENSES[kind][0]},
-        }
+        }  # fmt: skip
     return [write_atomic(path, dump_json(content))]
 
 

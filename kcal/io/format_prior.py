@@ -101,16 +101,12 @@ def prior_of(program: str, camera: Camera, misfit: tuple[float, float] | None = 
     found = square_root_information(camera, chosen)
     root, held = (None, ()) if found is None else found
     values = (
-        foreign.camera_name(camera, "camera"),
-        model,
-        list(camera.size),
-        [parameter.name for parameter in order],
-        foreign.plain(camera.params[chosen] * scale + offset),
-        None if root is None else foreign.plain(root / scale),
+        foreign.camera_name(camera, "camera"), model, list(camera.size), [parameter.name for parameter in order],
+        foreign.plain(camera.params[chosen] * scale + offset), None if root is None else foreign.plain(root / scale),
         [parameter.name for parameter in order if parameter.kcal in held],
         None if misfit is None else dict(zip(("rms", "largest"), misfit, strict=True)),
         {"model": str(camera.model), "parameters": [list(parameter[1:]) for parameter in order]},
-    )
+    )  # fmt: skip
     return dict(zip(KEYS, values, strict=True))
 
 

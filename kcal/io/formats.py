@@ -298,12 +298,9 @@ def import_cameras(
     foreign = [camera for part in parts if part.format != "kcal" for camera in part.cameras]
     notes += [f"{camera_name(camera, 'camera')}: {text}" for camera in foreign if (text := _doubt(camera, paths[0]))]
     return ImportedCameras(
-        format=parts[0].format,
-        cameras=cameras,
-        poses=poses if len(poses) == len(cameras) else (),
-        notes=tuple(dict.fromkeys(notes)),
-        unread=unread,
-    )
+        format=parts[0].format, cameras=cameras, poses=poses if len(poses) == len(cameras) else (),
+        notes=tuple(dict.fromkeys(notes)), unread=unread,
+    )  # fmt: skip
 
 
 def _doubt(camera: Camera, path: str | Path) -> str:

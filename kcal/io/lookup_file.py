@@ -73,14 +73,10 @@ def save_lookup(camera: LookupCamera, path: str | Path) -> Path:
         ((640, 480), [640, 480])
     """
     arrays = {
-        "kcal": np.array(KIND),
-        "version": np.array(VERSION),
-        "image_size": np.array(camera.size),
-        "center": camera.center.cpu().numpy(),
-        "bound": np.array(camera.bound),
-        "coverage": np.array(camera.coverage),
+        "kcal": np.array(KIND), "version": np.array(VERSION), "image_size": np.array(camera.size),
+        "center": camera.center.cpu().numpy(), "bound": np.array(camera.bound), "coverage": np.array(camera.coverage),
         "source": np.array(camera.source),
-    }
+    }  # fmt: skip
     for name, attribute in _TABLES.items():
         table: Spline = getattr(camera, attribute)
         for part, value in table._asdict().items():
@@ -121,11 +117,9 @@ def load_lookup(path: str | Path) -> LookupCamera:
         return LookupCamera(
             size=check_pixel_count((int(width), int(height))),
             center=torch.tensor(_two(arrays, "center", "f", -math.inf, math.inf), dtype=torch.float64),
-            bound=_two(arrays, "bound", "f", 0.0, math.inf),
-            coverage=_two(arrays, "coverage", "f", 0.0, 1.0),
-            source=str(arrays["source"]),
-            **tables,
-        )
+            bound=_two(arrays, "bound", "f", 0.0, math.inf), coverage=_two(arrays, "coverage", "f", 0.0, 1.0),
+            source=str(arrays["source"]), **tables,
+        )  # fmt: skip
     except KeyError as error:
         raise FileError(f"{path}: bad lookup file: {error.args[0]} is missing") from error
     except (InputError, ValueError, TypeError, IndexError) as error:
@@ -189,16 +183,10 @@ def save_onnx(module: nn.Module, example: Tensor | Sequence[Tensor], path: str |
                 # Two inputs share one number of points, which is what is wanted.
                 warnings.filterwarnings("ignore", message="# The axis name")
                 torch.onnx.export(
-                    module.eval(),
-                    examples,
-                    written,
-                    dynamo=True,
-                    dynamic_shapes=tuple({0: count} for _ in examples),
-                    external_data=False,
-                    optimize=False,
-                    verbose=False,
+                    module.eval(), examples, written, dynamo=True, dynamic_shapes=tuple({0: count} for _ in examples),
+                    external_data=False, optimize=False, verbose=False,
                     custom_translation_table={torch.ops.aten.scalar_tensor.default: _scalar_tensor},
-                )
+                )  # fmt: skip
             os.replace(written, path)
     except OSError as error:
         raise FileError(f"{path}: cannot write: {error.strerror or error}") from error

@@ -148,13 +148,10 @@ class InformationRecord(Record):
                 groups[slot].append(name)
         others = None if known.others is None else Packed.of(_above(known.told.compressed().rows))
         return cls(
-            unknowns=tuple(map(tuple, groups)),
-            board=tuple(known.estimate[known.lens_size :].tolist()),
-            triangle=Packed.of(_above(known.data.compressed().rows)),
-            mean=tuple(known.mean.tolist()),
-            sigma=tuple(value if math.isfinite(value) else None for value in known.sigma.tolist()),
-            others=others,
-        )
+            unknowns=tuple(map(tuple, groups)), board=tuple(known.estimate[known.lens_size :].tolist()),
+            triangle=Packed.of(_above(known.data.compressed().rows)), mean=tuple(known.mean.tolist()),
+            sigma=tuple(value if math.isfinite(value) else None for value in known.sigma.tolist()), others=others,
+        )  # fmt: skip
 
     def information(self, values: dict[str, float]) -> CameraInformation:
         """The `CameraInformation` of a camera with these values of its parameters, by name, in their order."""
@@ -234,12 +231,10 @@ class NetworkRecord(Record):
         """As it is stored."""
         state = {name: value.detach().cpu().contiguous() for name, value in modes.trunk.state_dict().items()}
         return cls(
-            layers=_chain_texts(modes.trunk),
-            kind=modes.trunk.__class__.__name__,
+            layers=_chain_texts(modes.trunk), kind=modes.trunk.__class__.__name__,
             features=None if modes.vector else len(modes) // 2,
-            weights=base64.b64encode(safetensors.torch.save(state)).decode("ascii"),
-            digest=modes.digest,
-        )
+            weights=base64.b64encode(safetensors.torch.save(state)).decode("ascii"), digest=modes.digest,
+        )  # fmt: skip
 
     @property
     def known(self) -> bool:

@@ -135,13 +135,9 @@ def camera_features(run: Located) -> list[bytes]:
         properties: dict[str, Any] = {"name": f"{camera.name} camera", "kind": "camera"}
         if camera.name == "left":
             properties |= {
-                "heading_deg": run.heading_deg,
-                "pitch_deg": run.pitch_deg,
-                "roll_deg": run.roll_deg,
-                "pixel_sigma": run.pixel_sigma,
-                "range_interval": run.interval_note,
-                "geoid": run.geoid,
-            }
+                "heading_deg": run.heading_deg, "pitch_deg": run.pitch_deg, "roll_deg": run.roll_deg,
+                "pixel_sigma": run.pixel_sigma, "range_interval": run.interval_note, "geoid": run.geoid,
+            }  # fmt: skip
         lat, lon, height = camera.geodetic
         features.append(_feature({"type": "Point", "coordinates": [lon, lat, height]}, properties))
     return features

@@ -331,16 +331,9 @@ class EarthFrame(NamedTuple):
 
 
 def stated_ahead(
-    frame: EarthFrame,
-    place: Tensor,
-    ray: Tensor,
-    first: Tensor,
-    alone: Tensor,
-    *,
-    height: Tensor | Ground,
-    sigma: float,
-    differentiated: bool,
-) -> StatedHeight:
+    frame: EarthFrame, place: Tensor, ray: Tensor, first: Tensor, alone: Tensor, *, height: Tensor | Ground,
+    sigma: float, differentiated: bool,
+) -> StatedHeight:  # fmt: skip
     """Where rays (N, 3) from places of cameras first reach heights (N,) above the ellipsoid, or the ground.
 
     Args:

@@ -423,17 +423,11 @@ class Localizer(Operations, Movable, StatedModule):
         enu, covariance, bearing, misfit = positions
         step, ok = self.freed_step, reach.status == int(PositionStatus.OK)
         return Localization(
-            enu=enu,
-            covariance=covariance,
-            geodetic=self._geodetic(enu if step is None else enu + step[0], ok),
-            bearing=bearing,
-            reprojection=stereo.reprojection_errors(found.fit.residual),
-            anchor=found.anchor.to(torch.int64).argmax(-1),
-            used=found.used,
-            bad=torch.zeros_like(found.used),
-            misfit=misfit,
-            **reach._asdict(),
-        )
+            enu=enu, covariance=covariance, geodetic=self._geodetic(enu if step is None else enu + step[0], ok),
+            bearing=bearing, reprojection=stereo.reprojection_errors(found.fit.residual),
+            anchor=found.anchor.to(torch.int64).argmax(-1), used=found.used, bad=torch.zeros_like(found.used),
+            misfit=misfit, **reach._asdict(),
+        )  # fmt: skip
 
     def _geodetic(self, enu: Tensor, ok: Tensor) -> Tensor:
         if self.ecef_from_enu is None:

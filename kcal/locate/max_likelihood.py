@@ -114,17 +114,10 @@ class _Fixed(NamedTuple):
 
 
 def most_likely(
-    cameras: Sequence[RelativeCamera],
-    scale: Tensor,
-    start: tuple[Tensor, Tensor],
-    pixels: Tensor,
-    usable: Tensor,
-    weight: Tensor | None = None,
-    *,
-    by_camera: bool = False,
-    differentiated: bool = False,
+    cameras: Sequence[RelativeCamera], scale: Tensor, start: tuple[Tensor, Tensor], pixels: Tensor, usable: Tensor,
+    weight: Tensor | None = None, *, by_camera: bool = False, differentiated: bool = False,
     around: Surroundings | None = None,
-) -> PointFit:
+) -> PointFit:  # fmt: skip
     """Minimize the weighted squares of the reprojection errors, each point on its own.
 
     Args:

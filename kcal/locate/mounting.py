@@ -65,13 +65,9 @@ def mounting_of(
     both = torch.block_diag(turn, turn, torch.eye(len(covariance) - 6, dtype=torch.float64))
     heading, pitch, roll = attitude(turn @ cam_from_enu.T)
     return Mounting(
-        origin=Origin(lat=lat, lon=lon, height=height),
-        heading_deg=heading,
-        pitch_deg=pitch,
-        roll_deg=roll,
-        covariance=both @ covariance @ both.T,
-        refraction=refraction,
-    )
+        origin=Origin(lat=lat, lon=lon, height=height), heading_deg=heading, pitch_deg=pitch, roll_deg=roll,
+        covariance=both @ covariance @ both.T, refraction=refraction,
+    )  # fmt: skip
 
 
 @in_one_thread

@@ -590,13 +590,9 @@ def _chosen(row: Tensor, tracks: Sequence[MovingTrack], one: _Seen) -> int | Non
 
 
 def _moving_landmarks(
-    tracks: Sequence[MovingTrack],
-    matched: Sequence[tuple[_Seen, str]],
-    count: int,
-    names: Sequence[str],
-    clock: float,
+    tracks: Sequence[MovingTrack], matched: Sequence[tuple[_Seen, str]], count: int, names: Sequence[str], clock: float,
     options: MovingOptions,
-) -> Landmarks:
+) -> Landmarks:  # fmt: skip
     """One landmark for each fix: at the time nearest to it, preferably one that several cameras saw."""
     rows = []
     for k, track in enumerate(tracks):
@@ -632,13 +628,9 @@ def _moving_landmarks(
 
 
 def _shared_shifts(
-    tracks: Sequence[MovingTrack],
-    of: Tensor,
-    velocity: Tensor,
-    pixels: Tensor,
-    names: Sequence[str],
+    tracks: Sequence[MovingTrack], of: Tensor, velocity: Tensor, pixels: Tensor, names: Sequence[str],
     options: MovingOptions,
-) -> tuple[Effect, ...]:
+) -> tuple[Effect, ...]:  # fmt: skip
     """Clocks, latencies and constant offsets, as far as there are any."""
     count = pixels.shape[1]
     everywhere = velocity[:, None].expand(-1, count, -1)

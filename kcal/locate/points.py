@@ -197,17 +197,11 @@ class PointLocator:
         localize = self.localize
         heading, pitch, roll = localize.attitude_deg if localize.on_earth else (math.nan,) * 3
         return Located(
-            columns=columns or PositionColumns.joined([]),
-            cameras=self.cameras,
-            origin=localize.origin,
-            heading_deg=heading,
-            pitch_deg=pitch,
-            roll_deg=roll,
-            pixel_sigma=float(localize.pixel_sigma),
-            included=localize.included,
-            geoid=None if self.geoid is None else self.geoid.name,
+            columns=columns or PositionColumns.joined([]), cameras=self.cameras, origin=localize.origin,
+            heading_deg=heading, pitch_deg=pitch, roll_deg=roll, pixel_sigma=float(localize.pixel_sigma),
+            included=localize.included, geoid=None if self.geoid is None else self.geoid.name,
             centers=localize.rig.center.detach().cpu() if localize.weights == "all" else None,
-        )
+        )  # fmt: skip
 
 
 def _as_columns(

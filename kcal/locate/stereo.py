@@ -163,13 +163,9 @@ Tensors = TypeVar("Tensors", bound=tuple)
 
 
 def piece_by_piece(
-    locate: Callable[..., Tensors],
-    first: Tensor,
-    *others: Tensor | None,
-    differentiated: bool,
-    axis: int = -2,
+    locate: Callable[..., Tensors], first: Tensor, *others: Tensor | None, differentiated: bool, axis: int = -2,
     share: int = 1,
-) -> Tensors:
+) -> Tensors:  # fmt: skip
     """Call `locate(first, *others)`, in pieces that fit the cache where nothing is traced or differentiated.
 
     Args:

@@ -211,12 +211,9 @@ def match_landmarks(survey: Survey, marks: Marks, pixel_sigma: float | Tensor) -
     common = tuple(survey.names[i] for i in places)
     rows = [index[name] for name in common]
     landmarks = Landmarks(
-        names=common,
-        points=survey.points[places],
-        sigma=survey.sigma[places],
-        pixels=marks.pixels[rows],
+        names=common, points=survey.points[places], sigma=survey.sigma[places], pixels=marks.pixels[rows],
         pixel_sigma=pixel_sigma[rows] if isinstance(pixel_sigma, Tensor) else pixel_sigma,
-    )
+    )  # fmt: skip
     unmarked = tuple(name for name in survey.names if name not in index)
     return MarkedLandmarks(landmarks, unmarked, tuple(name for name in marks.names if name not in common))
 
@@ -250,12 +247,9 @@ def read_features(path: str | Path, pixel_sigma: float, cameras: Sequence[str] =
     ]
     known = torch.tensor([inverse_range_of(row) for row in rows], dtype=torch.float64).reshape(-1, 2)
     return Features(
-        names=tuple(marks.names),
-        pixels=marks.pixels,
-        inverse_range=known[:, 0],
-        inverse_range_sigma=known[:, 1],
+        names=tuple(marks.names), pixels=marks.pixels, inverse_range=known[:, 0], inverse_range_sigma=known[:, 1],
         pixel_sigma=marks.sigmas(pixel_sigma),
-    )
+    )  # fmt: skip
 
 
 def inverse_range_of(row: TableRow) -> tuple[float, float]:

@@ -216,16 +216,10 @@ class ViewsFit(NamedTuple):
 
 
 def fit_views(
-    posed: PosedCameras,
-    pixels: Tensor,
-    seen: Tensor,
-    *,
-    noise: Tensor | float,
-    cov: Tensor | None = None,
-    shared: CommonErrors | None = None,
-    height: Callable[[Tensor, Tensor, Tensor, Tensor], StatedHeight] | None = None,
+    posed: PosedCameras, pixels: Tensor, seen: Tensor, *, noise: Tensor | float, cov: Tensor | None = None,
+    shared: CommonErrors | None = None, height: Callable[[Tensor, Tensor, Tensor, Tensor], StatedHeight] | None = None,
     differentiated: bool = False,
-) -> ViewsFit:
+) -> ViewsFit:  # fmt: skip
     """The most likely point of each row of views: in closed form first, then by `most_likely`.
 
     Args:
@@ -378,16 +372,9 @@ def _weight(cov: Tensor | None, noise: Tensor | float, used: Tensor, moved: Tens
 
 
 def fit_pairs(
-    rig: Rig,
-    left: Tensor,
-    right: Tensor,
-    cov: Tensor | None = None,
-    mask: Tensor | None = None,
-    *,
-    noise: Tensor | float = 1.0,
-    by_camera: bool = False,
-    differentiated: bool = False,
-) -> ViewsFit:
+    rig: Rig, left: Tensor, right: Tensor, cov: Tensor | None = None, mask: Tensor | None = None, *,
+    noise: Tensor | float = 1.0, by_camera: bool = False, differentiated: bool = False,
+) -> ViewsFit:  # fmt: skip
     """The most likely point of each pixel pair, in the left camera's frame: weighed by the marks' noise alone.
 
     A pair counts as a whole: `sight_lines` says which have a point.

@@ -316,22 +316,12 @@ def _checked_attitude(
     total = np.diag(turn @ fit.covariance @ turn.T)
     back = fit.rotation.T
     return SkylineAttitude(
-        rotation=fit.rotation,
-        heading_deg=heading,
-        pitch_deg=pitch,
-        roll_deg=roll,
-        sigma_deg=sigma,
+        rotation=fit.rotation, heading_deg=heading, pitch_deg=pitch, roll_deg=roll, sigma_deg=sigma,
         covariance=widened**2 * back @ fit.covariance @ back.T,
-        shares={name: np.diag(turn @ part @ turn.T) / total for name, part in fit.parts.items()},
-        widened=widened,
-        border=border,
-        used=used,
-        expected=expected,
-        second_deg=others[0].heading if others else math.nan,
-        second_worse=worse,
-        warnings=tuple(_attitude_warnings(fit, columns, horizon, above, widened)),
-        fit=fit,
-    )
+        shares={name: np.diag(turn @ part @ turn.T) / total for name, part in fit.parts.items()}, widened=widened,
+        border=border, used=used, expected=expected, second_deg=others[0].heading if others else math.nan,
+        second_worse=worse, warnings=tuple(_attitude_warnings(fit, columns, horizon, above, widened)), fit=fit,
+    )  # fmt: skip
 
 
 def _angles_by_turn(rotation: Floats) -> Floats:
@@ -505,17 +495,13 @@ def _joined(
     basis, size, _ = np.linalg.svd(np.column_stack(moves), full_matrices=False)
     compact = basis[:, size > _TELLS].T @ white
     return SkylineSource(
-        cameras=tuple(image.camera for image in images),
-        names=tuple(image.name for image in images),
-        rotation=rotation,
-        center=center,
-        parameters=tuple(camera.params.detach() for camera in cameras),
-        rows=torch.from_numpy(compact[:, :-1].copy()),
-        residual=torch.from_numpy(compact[:, -1].copy()),
+        cameras=tuple(image.camera for image in images), names=tuple(image.name for image in images), rotation=rotation,
+        center=center, parameters=tuple(camera.params.detach() for camera in cameras),
+        rows=torch.from_numpy(compact[:, :-1].copy()), residual=torch.from_numpy(compact[:, -1].copy()),
         columns=tuple(int(one.used.sum()) for one in found),
         rms_px=tuple(float(np.sqrt(np.mean(np.square(one.fit.binned.residual)))) for one in found),
         sigmas=tuple(math.sqrt(one.fit.chi2 / max(one.fit.freedom, 1)) for one in found),
-    )
+    )  # fmt: skip
 
 
 def _world_from_eye(origin: Origin, eye: Origin) -> Floats:

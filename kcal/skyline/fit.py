@@ -310,15 +310,9 @@ def fit_rotation(
     by_part = {name: gain @ part @ gain.T for name, part in parts.items()}
     left = rows[:, 3]
     return SkylineFit(
-        rotation,
-        used,
-        below,
-        binned,
-        sum(by_part.values(), np.zeros((3, 3))),
-        by_part,
-        float(left @ left),
+        rotation, used, below, binned, sum(by_part.values(), np.zeros((3, 3))), by_part, float(left @ left),
         len(left) - 3,
-    )
+    )  # fmt: skip
 
 
 def _robust_rotation(

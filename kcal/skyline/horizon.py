@@ -632,19 +632,13 @@ def compare(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera
     risen = (low * up * sine, low * up * cosine, -np.square(low))
     shift = [(by_azimuth * a + by_elevation * e) / distance for a, e in zip(aside, risen, strict=True)]
     return Comparison(
-        residual=(off * across).sum(0),
-        sigma=columns.sigma * np.abs(across[1]),
-        by_turn=of(step_rows(seen.by_point, turned)[:3].numpy()),
-        by_elevation=of(higher),
+        residual=(off * across).sum(0), sigma=columns.sigma * np.abs(across[1]),
+        by_turn=of(step_rows(seen.by_point, turned)[:3].numpy()), by_elevation=of(higher),
         by_shift=np.stack([of(moved(one)) for one in shift], -1),
-        by_lens=of(seen.by_camera.numpy()) if lens else np.zeros((len(azimuth), 0)),
-        elevation=elevation,
-        distance=distance,
-        point=np.where(known[:, None], horizon.point[near], 0.0),
-        raised=horizon.raised[near],
-        blunted=horizon.blunted[near],
-        known=known,
-    )
+        by_lens=of(seen.by_camera.numpy()) if lens else np.zeros((len(azimuth), 0)), elevation=elevation,
+        distance=distance, point=np.where(known[:, None], horizon.point[near], 0.0), raised=horizon.raised[near],
+        blunted=horizon.blunted[near], known=known,
+    )  # fmt: skip
 
 
 def columns_of(row: Floats, sigma: Floats, camera: Camera) -> Columns:

@@ -144,13 +144,9 @@ def joint_calibration(
     assert known.sigma is not None
     doubts = [] if agreement.contradiction is None else [Finding("stars", "doubt", agreement.contradiction)]
     return dataclasses.replace(
-        boards,
-        camera=found.camera,
-        sigma={name: known.sigma[name] for name in boards.sigma},
-        covariance=known.information.covariance(),
-        information=known.information,
-        findings=(*boards.findings, *doubts),
-    )
+        boards, camera=found.camera, sigma={name: known.sigma[name] for name in boards.sigma},
+        covariance=known.information.covariance(), information=known.information, findings=(*boards.findings, *doubts),
+    )  # fmt: skip
 
 
 def _known_lens(lens: CameraInformation, sigma: Tensor) -> Gaussian:
@@ -182,12 +178,9 @@ def _by_evidence(
     data = Gaussian(slots, lens.estimate, torch.cat([lens.rows, lens.residuals[:, None]], 1))
     assert hybrid.model.hybrid is not None
     capture = dataclasses.replace(
-        stars.fitted(hybrid.size),
-        weights=stars.weights / stars.noise,
-        hyperprior=typical_hyperprior(hybrid.model.hybrid.modes),
-        square=hybrid.square,
-        known=data,
-    )
+        stars.fitted(hybrid.size), weights=stars.weights / stars.noise,
+        hyperprior=typical_hyperprior(hybrid.model.hybrid.modes), square=hybrid.square, known=data,
+    )  # fmt: skip
 
     def near(capture: FittedViews, estimate: Estimate) -> FittedViews:
         nonlocal stars
@@ -239,12 +232,10 @@ def _agreement_with(stars: Tensor, change: Tensor, lens: CameraInformation, coun
         else 1.0
     )
     return Agreement(
-        chi2=chi2,
-        freedom=freedom,
-        by_chance=min(2.0 * by_chance, 1.0),
+        chi2=chi2, freedom=freedom, by_chance=min(2.0 * by_chance, 1.0),
         moved_px=sigma * math.sqrt(float((rows @ change).square().sum()) / count),
         stated_px=sigma * math.sqrt(float(spread.square().sum()) / count),
-    )
+    )  # fmt: skip
 
 
 # A camera from night images alone: stars named by their pattern, the field of view unknown, then the lens fitted.
@@ -358,24 +349,16 @@ def calibrate_by_stars(
         progress("lens")
     assert lens is not None
     return StarCamera(
-        lens=lens,
-        images=tuple(seen),
-        stars=tuple(one.star for one in seen.values()),
-        pixels=tuple(one.field.pixels.numpy() for one in seen.values()),
-        refused=refused,
-        agreement=agreement,
+        lens=lens, images=tuple(seen), stars=tuple(one.star for one in seen.values()),
+        pixels=tuple(one.field.pixels.numpy() for one in seen.values()), refused=refused, agreement=agreement,
         joint=None if boards is None or agreement is None else joint_calibration(boards, lens, agreement),
-    )
+    )  # fmt: skip
 
 
 def _first_lens(
-    images: Sequence[DetectedStars],
-    views: Sequence[SkyView],
-    order: Sequence[int],
-    cameras: Sequence[Camera],
-    catalog: StarCatalog,
-    progress: Callable[[str], object],
-) -> tuple[Camera, dict[int, np.ndarray]]:
+    images: Sequence[DetectedStars], views: Sequence[SkyView], order: Sequence[int], cameras: Sequence[Camera],
+    catalog: StarCatalog, progress: Callable[[str], object],
+) -> tuple[Camera, dict[int, np.ndarray]]:  # fmt: skip
     """A rough camera from the first image whose stars have names, and its rotation."""
     # More triangles take five times as long: of one image, where few have failed in all.
     tries = [(_FEW_CORNERS, number) for number in order[:_TRIES]] + [(_MORE_CORNERS, number) for number in order[:1]]
@@ -412,13 +395,9 @@ def _plain_cameras(size: tuple[int, int], focal: float | None) -> list[Camera]:
 
 
 def _search(
-    found: DetectedStars,
-    tried: Sequence[Camera],
-    corners: int,
-    catalog: StarCatalog,
-    progress: Callable[[str], object],
-    what: str,
-) -> tuple[Identification, Camera] | None:
+    found: DetectedStars, tried: Sequence[Camera], corners: int, catalog: StarCatalog,
+    progress: Callable[[str], object], what: str,
+) -> tuple[Identification, Camera] | None:  # fmt: skip
     """Names of the stars in the middle of an image, and a plain camera, from the first of those tried that fits."""
     size = tried[0].size
     center = np.array([(size[0] - 1) / 2, (size[1] - 1) / 2])
@@ -454,12 +433,9 @@ def _by_camera(found: DetectedStars, camera: Camera, catalog: StarCatalog) -> Id
 
 
 def _from_middle_outward(
-    images: Sequence[DetectedStars],
-    views: Sequence[SkyView],
-    camera: Camera,
-    rotations: dict[int, np.ndarray],
+    images: Sequence[DetectedStars], views: Sequence[SkyView], camera: Camera, rotations: dict[int, np.ndarray],
     catalog: StarCatalog,
-) -> tuple[Camera, dict[int, np.ndarray]]:
+) -> tuple[Camera, dict[int, np.ndarray]]:  # fmt: skip
     """A camera from one image, whose stars get names from the middle outward while the lens becomes better known."""
     assert camera.size is not None
     size = camera.size
@@ -488,12 +464,9 @@ class _StarImage(NamedTuple):
 
 
 def _star_fields(
-    images: Sequence[DetectedStars] | dict[int, DetectedStars],
-    views: Sequence[SkyView],
-    camera: Camera,
-    rotations: dict[int, np.ndarray],
-    catalog: StarCatalog,
-) -> dict[int, _StarImage]:
+    images: Sequence[DetectedStars] | dict[int, DetectedStars], views: Sequence[SkyView], camera: Camera,
+    rotations: dict[int, np.ndarray], catalog: StarCatalog,
+) -> dict[int, _StarImage]:  # fmt: skip
     """Stars with names of each image whose attitude is roughly known, in its own frame, by its number."""
     seen = {}
     for number, rotation in sorted(rotations.items()):

@@ -95,13 +95,9 @@ class StarViews(NamedTuple):
         return FittedViews(
             points=self.points,
             board=BoardModes(self.points.new_zeros(0, 3, count), none, torch.zeros(0, dtype=torch.int64)),
-            pixels=self.pixels,
-            size=size,
-            weights=self.weights,
-            hyperprior=typical_hyperprior(),
-            exact=True,
+            pixels=self.pixels, size=size, weights=self.weights, hyperprior=typical_hyperprior(), exact=True,
             turning=True,
-        )
+        )  # fmt: skip
 
 
 def star_state(parameters: Tensor, rotations: Sequence[Tensor]) -> BoardState:
@@ -257,11 +253,9 @@ def star_lens(
     # Of all that is known, the share that stars tell.
     told = rows @ information.without_board().half().T
     return StarLens(
-        camera=camera,
-        rotations=tuple(state.rotation),
+        camera=camera, rotations=tuple(state.rotation),
         residuals=tuple(own[:count] for own, count in zip(errors, counts, strict=True)),
         used=tuple(own[:count] for own, count in zip(used, counts, strict=True)),
-        rms_px=float(errors[used].square().mean().sqrt()),
-        widened=math.sqrt(stars.variance),
+        rms_px=float(errors[used].square().mean().sqrt()), widened=math.sqrt(stars.variance),
         effective=float(told.square().sum()),
-    )
+    )  # fmt: skip

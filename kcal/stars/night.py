@@ -117,13 +117,9 @@ def fit_attitude(
     widened = max(math.sqrt(chi2 / freedom), 1.0)
     own = torch.linalg.inv(white.T @ white) * widened**2
     return Attitude(
-        rotation=turn,
-        covariance=turn.T @ own @ turn,
-        star=star,
-        residual=residual,
-        rms_px=float(np.sqrt((off**2).mean())),
-        widened=widened,
-    )
+        rotation=turn, covariance=turn.T @ own @ turn, star=star, residual=residual,
+        rms_px=float(np.sqrt((off**2).mean())), widened=widened,
+    )  # fmt: skip
 
 
 def refraction_doubt(seen: Attitude, sigma: Floats, refracted: Tensor, straight: Tensor, camera: Camera) -> str | None:

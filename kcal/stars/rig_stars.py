@@ -108,13 +108,10 @@ def star_source(
     if on_earth:
         effects += _effects_on_earth(second, moments, rows, len(cameras), catalog)
     return StarSource(
-        names=tuple(row.name for row in rows),
-        pixels=torch.from_numpy(marks[..., :2].copy()),
-        pixel_sigma=torch.from_numpy(marks[..., 2].copy()),
-        direction=direction,
-        direction_sigma=sigma,
+        names=tuple(row.name for row in rows), pixels=torch.from_numpy(marks[..., :2].copy()),
+        pixel_sigma=torch.from_numpy(marks[..., 2].copy()), direction=direction, direction_sigma=sigma,
         effects=tuple(effects),
-    )
+    )  # fmt: skip
 
 
 def moments_of(

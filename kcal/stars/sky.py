@@ -107,13 +107,10 @@ class StarCatalog:
         table = np.frombuffer(read_bytes(PACKED_FILE), PACKED)
         ra, dec = (table[name].astype(np.float64) * _TURN for name in ("ra", "dec"))
         return StarCatalog(
-            number=table["number"].astype(np.int64),
-            ra=ra % (2 * np.pi),
-            dec=dec,
-            pm_ra=table["pm_ra"] * _MILLIARCSECOND,
-            pm_dec=table["pm_dec"] * _MILLIARCSECOND,
+            number=table["number"].astype(np.int64), ra=ra % (2 * np.pi), dec=dec,
+            pm_ra=table["pm_ra"] * _MILLIARCSECOND, pm_dec=table["pm_dec"] * _MILLIARCSECOND,
             magnitude=table["magnitude"] / 100.0,
-        )
+        )  # fmt: skip
 
     def name_of(self, number: int) -> str:
         """A star's proper name, where it has a well known one, otherwise `HR 1234`."""
