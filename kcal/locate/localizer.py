@@ -330,13 +330,13 @@ class Localizer(Operations, Movable, StatedModule):
                 )
             left, right = stereo.checked_pairs(pixels, other, self.rig)
             if self.weights == "marks" and velocity is None and height is None:
-                return self._of_pairs(left, right, stereo.checked_pair_covariance(cov, left), mask)
+                return self._of_pairs(left, right, stereo.checked_covariance(cov, left.shape[:-1], (4, 4), left), mask)
             pixels, other = torch.stack([left, right], -2), None
         pixels, seen = stereo.checked_views(pixels, other, count, like)
         lead = pixels.shape[:-2]
         if mask is not None:
             seen = seen & stereo.checked_mask(mask, lead, pixels.device)[..., None]
-        cov = stereo.checked_views_covariance(cov, pixels)
+        cov = stereo.checked_covariance(cov, lead, (count, 2, 2))
         if velocity is not None:
             moved = self.clock_sigma * expanded("velocity", as_points("velocity", velocity, 2, pixels), pixels.shape)
             still = torch.eye(2, dtype=torch.float64, device=pixels.device)
