@@ -111,8 +111,7 @@ def fit_ellipses(image: npt.NDArray[np.generic], center: Tensor, shape: Tensor, 
     covariance = torch.linalg.inv(scaled)[:, :2, :2] / (unit[:, :2, None] * unit[:, None, :2]) * noise[:, None, None]
     return Ellipses(
         center + p[:, :2], p[:, [2, 3, 3, 4]].unflatten(-1, (2, 2)), covariance, p[:, 7], p[:, 6],
-        noise.sqrt() / p[:, 6].abs().clamp_min(1e-9),
-        step < _CONVERGED,
+        noise.sqrt() / p[:, 6].abs().clamp_min(1e-9), step < _CONVERGED,
     )  # fmt: skip
 
 
