@@ -68,8 +68,8 @@ class PositionColumns(NamedTuple):
     def rows(self, which: NDArray[np.intp] | slice) -> PositionColumns:
         """Some of the pairs."""
 
-        def some(cells: Sequence[str]) -> list[str]:
-            return list(cells[which]) if isinstance(which, slice) else [cells[i] for i in which.tolist()]
+        def some(cells: Any) -> Any:
+            return cells[which] if isinstance(which, slice) else [cells[i] for i in which.tolist()]
 
         extras = {name: some(cells) for name, cells in self.extras.items()}
         names, reasons = some(self.names), some(self.reasons)
