@@ -109,7 +109,7 @@ def _sensor_covariance(sensor: Element, own: dict[str, tuple[str, ...]], names: 
     return moved @ (0.5 * (spread + spread.T)) @ moved.T
 
 
-# COLMAP's `cameras.txt` and `cameras.bin`. Pixel (0.5, 0.5) is the center of the first pixel there.
+# COLMAP's `cameras.txt` and `cameras.bin`.
 
 # Pixel (0.5, 0.5) is the center of the first pixel in files of COLMAP and nerfstudio.
 _HALF = 0.5
