@@ -26,6 +26,7 @@ from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
 from kcal.locate.mounting import attitude, by_mounting, leveled, station_mounting
 from kcal.locate.stereo import Localization, PositionStatus, Sensitivity
+from kcal.locate.views import CommonErrors, PosedCameras
 from kcal.operation import Operations, shapes_of
 
 Weights = Literal["marks", "all"]
@@ -487,7 +488,7 @@ class Localizer(Operations, Movable, StatedModule):
             bad = chosen & (wrong & ~torn)[..., None]
         return self._by_all(posed, views, falls), bad, torn
 
-    def _by_all(self, posed: viewing.PosedCameras, views: viewing.ViewsFit, falls: Tensor) -> Localization:
+    def _by_all(self, posed: PosedCameras, views: viewing.ViewsFit, falls: Tensor) -> Localization:
         fit, variance = views.fit, views.variance * inverse_variance(views.fit, views.fit.covariance)
         reach = viewing.reach_of(views, variance, views.behind(posed.center))
         ok = reach.status == int(PositionStatus.OK)
@@ -508,15 +509,15 @@ class Localizer(Operations, Movable, StatedModule):
         )
 
     @property
-    def posed(self) -> viewing.PosedCameras:
+    def posed(self) -> PosedCameras:
         """The cameras as they stand, where all errors weigh."""
         rig = self.rig
-        return viewing.PosedCameras(rig.each, rig.rotation, rig.center, self.up, rig.refraction * self.half_curvature)
+        return PosedCameras(rig.each, rig.rotation, rig.center, self.up, rig.refraction * self.half_curvature)
 
     @property
-    def common(self) -> viewing.CommonErrors | None:
+    def common(self) -> CommonErrors | None:
         """What marks of a camera have in common; None where all is exact."""
-        return None if self.errors is None else viewing.CommonErrors(self.lens, self.errors, self.bending_errors)
+        return None if self.errors is None else CommonErrors(self.lens, self.errors, self.bending_errors)
 
     @property
     def _two(self) -> Rig:

@@ -28,6 +28,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.information import LENS_SLOT, CameraInformation
 from kcal.solve.lm import LMOptions, minimize
 from kcal.stars.detect import DetectedStars
+from kcal.stars.lens_fit import StarField, StarLens
 from kcal.stars.night import SkyView, fit_attitude
 from kcal.stars.sky import Identification, StarCatalog, celestial_directions, identify, turn_between
 from kcal.texts import brief
@@ -80,8 +81,8 @@ class Agreement(NamedTuple):
 
 
 def refine_by_stars(
-    fields: Sequence[fits.StarField], rotations: Sequence[Tensor], boards: CameraCalibrationResult
-) -> tuple[fits.StarLens, Agreement]:
+    fields: Sequence[StarField], rotations: Sequence[Tensor], boards: CameraCalibrationResult
+) -> tuple[StarLens, Agreement]:
     """The posterior of a camera from boards and from the named stars of several images of it.
 
     The amplitudes of the default lens are those of largest evidence of both together.
@@ -129,7 +130,7 @@ def refine_by_stars(
 
 
 def joint_calibration(
-    boards: CameraCalibrationResult, found: fits.StarLens, agreement: Agreement
+    boards: CameraCalibrationResult, found: StarLens, agreement: Agreement
 ) -> CameraCalibrationResult:
     """The calibration by boards with camera, error bars and doubts of both; residuals stay those of boards alone.
 
@@ -270,7 +271,7 @@ class StarCamera:
 
     __repr__ = brief
 
-    lens: fits.StarLens
+    lens: StarLens
     images: tuple[int, ...]
     stars: tuple[np.ndarray, ...]
     pixels: tuple[np.ndarray, ...]
@@ -335,7 +336,7 @@ def calibrate_by_stars(
     progress("names")
     if not rotations:
         raise InputError(f"in none of {len(images)} images stars have names by the boards' camera: is it of this lens?")
-    lens: fits.StarLens | None = None
+    lens: StarLens | None = None
     agreement: Agreement | None = None
     for _ in range(3):
         seen = _star_fields(images, views, camera, rotations, catalog)
@@ -458,7 +459,7 @@ def _near_middle(found: DetectedStars, size: tuple[int, int], share: float) -> D
 class _StarImage(NamedTuple):
     """The named stars of an image, their numbers (N,) in the catalog, and the rotation from the stars' frame."""
 
-    field: fits.StarField
+    field: StarField
     star: np.ndarray
     rotation: Tensor
 
@@ -478,7 +479,7 @@ def _star_fields(
             continue
         use = best.star >= 0
         parts = directions[best.star[use]], found.pixels[use], found.sigma[use]
-        seen[number] = _StarImage(fits.StarField(*map(torch.from_numpy, parts)), best.star[use], best.rotation)
+        seen[number] = _StarImage(StarField(*map(torch.from_numpy, parts)), best.star[use], best.rotation)
     return seen
 
 
