@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -374,12 +375,7 @@ class Board(Record):
     @classmethod
     def of(cls, record: BoardRecord) -> Board:
         """The board that a calibration was made with, as far as its record tells: without markers."""
-        return cls.model_validate(
-            {
-                "columns": record.columns, "rows": record.rows, "square": record.square,
-                "pattern": record.pattern, "gap": record.gap,
-            }
-        )  # fmt: skip
+        return cls.model_validate(dataclasses.asdict(record))
 
     def __str__(self) -> str:
         plain = str(self.record)

@@ -111,17 +111,13 @@ def fit_ellipses(image: npt.NDArray[np.generic], center: Tensor, shape: Tensor, 
     covariance = torch.linalg.inv(scaled)[:, :2, :2] / (unit[:, :2, None] * unit[:, None, :2]) * noise[:, None, None]
     return Ellipses(
         center + p[:, :2],
-        _shape(p),
+        p[:, [2, 3, 3, 4]].unflatten(-1, (2, 2)),
         covariance,
         p[:, 7],
         p[:, 6],
         noise.sqrt() / p[:, 6].abs().clamp_min(1e-9),
         step < _CONVERGED,
     )
-
-
-def _shape(p: Tensor) -> Tensor:
-    return p[:, [2, 3, 3, 4]].unflatten(-1, (2, 2))
 
 
 def _is_ellipse(p: Tensor) -> Tensor:
@@ -332,7 +328,8 @@ def find_circles(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor, fl
         Traceback (most recent call last):
         kcal.corners.search.NotFoundError: no grid of 7x6 circles found
     """
-    reason, most = f"no grid of {board.columns}x{board.rows} {_kind(board)} found", 0
+    kind = "asymmetric circles" if board.pattern == "asymmetric" else "circles"
+    reason, most = f"no grid of {board.columns}x{board.rows} {kind} found", 0
     for _, small, scale in search_sizes(image):
         for picture in (small, 255 - small):
             blobs = round_blobs(picture)
@@ -434,10 +431,6 @@ def circle_order(pixels: Tensor, board: Board) -> Tensor | None:
         return None
     best = min(fits)[0]
     return max((fit for fit in fits if fit[0] < 2.0 * best + 0.02), key=lambda fit: fit[1])[2]
-
-
-def _kind(board: Board) -> str:
-    return "asymmetric circles" if board.pattern == "asymmetric" else "circles"
 
 
 def round_blobs(image: npt.NDArray[np.uint8], circularity: float = 0.0) -> list[cv2.KeyPoint]:

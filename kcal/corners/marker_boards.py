@@ -164,7 +164,7 @@ def find_charuco(image: npt.NDArray[np.uint8], board: Board, legacy: bool | None
         if several and len(today | before) >= _MOST * len(seen):
             raise NotFoundError(
                 f"{len(today.keys() - before)} markers lie as on boards of today only, "
-                f"{len(before.keys() - today)} as on those of OpenCV before 4.6 only: two boards; hide one",
+                f"{len(before.keys() - today)} as on those of OpenCV before 4.6 only: two boards; hide one"
             )
         # Markers in the middle of some boards lie alike in both but for a shift.
         told = None if len(today) == len(before) else len(before) > len(today)
@@ -345,7 +345,7 @@ def find_aprilgrid(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor, 
     if not tags and (others := [n for size in BORDERS for n in read_markers(image, board, TAGS, size, others=True)]):
         raise NotFoundError(
             f"tags {min(others)} to {max(others)} are seen, the board has {board.first} to "
-            f"{board.first + board.markers - 1}: another board, or give its first number (:idFIRST)",
+            f"{board.first + board.markers - 1}: another board, or give its first number (:idFIRST)"
         )
     twice = [number for number, found in tags.items() if len(found) > 1]
     if twice:
@@ -365,7 +365,7 @@ def find_aprilgrid(image: npt.NDArray[np.uint8], board: Board) -> tuple[Tensor, 
     if counts[turn] < min(3, len(seen)) or 2 * len(placed) < len(seen):
         raise NotFoundError(
             f"the {len(seen)} tags found do not lie as on this board: check how many it has in a row; numbers must "
-            "grow to the right and upward from the lower left",
+            "grow to the right and upward from the lower left"
         )
     pixels = torch.full((board.corners, 2), float("nan"), dtype=torch.float64)
     side = torch.ones(board.corners, dtype=torch.float64)

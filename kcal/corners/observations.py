@@ -297,16 +297,8 @@ def common_size(names: Sequence[str], sizes: Sequence[Size | None]) -> CommonSiz
             f"{_named(names, groups[w, h])} from {w}x{h} px by {_factor(most[0] / w, most[1] / h)}" for w, h in alike
         ]
         notes.append(f"images of several sizes: corners were scaled to {shown}: {'; '.join(texts)}")
-    reasons = {
-        (w, h): f"{w}x{h} px, not the {shown}: "
-        + (
-            "turned by 90 degrees, turn it back"
-            if (w, h) in turned
-            else "cropped or of another camera, take the original or leave it out"
-        )
-        for w, h in wrong
-    }
-    left_out = {i: reasons[size] for size in wrong for i in groups[size]}
+    cures = "cropped or of another camera, take the original or leave it out", "turned by 90 degrees, turn it back"
+    left_out = {i: f"{w}x{h} px, not the {shown}: {cures[(w, h) in turned]}" for w, h in wrong for i in groups[w, h]}
     if left_out:
         notes.append(
             f"{len(left_out)} of {len(sizes)} images were left out, because their size is not the {shown}: "

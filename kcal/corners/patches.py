@@ -84,9 +84,7 @@ class ImageWindows(NamedTuple):
 
     def at(self, which: Tensor) -> Self:
         """Those of the objects at some places."""
-        return self._replace(
-            values=self.values[which], saturated=self.saturated[which], corner=self.corner[which]
-        )  # fmt: skip
+        return self._replace(values=self.values[which], saturated=self.saturated[which], corner=self.corner[which])
 
 
 def image_windows(image: Tensor, pixels: Tensor, level: int, brightest: float) -> ImageWindows:
@@ -386,7 +384,7 @@ def fit_shifts(
         theta = torch.where(converged[:, None], theta, 0.0)
     shift = theta[:, :2]
     if is_differentiated(template, right.values):
-        shift = _implicit(patches, theta, scale, converged)[:, :2]
+        shift = _implicit(patches, still, theta, scale, converged)[:, :2]
     shear = theta.new_zeros(len(theta), 2) if grid is None else theta[:, 4:6]
     found = ShiftFit(shift, covariance, converged, share, shear)
     return ShiftFit(*(part.new_zeros(len(wanted), *part.shape[1:]).index_copy(0, which, part) for part in found))
@@ -487,14 +485,14 @@ def _blurred(columns: Tensor) -> Tensor:
     return wide.reshape(*columns.shape[:2], -1)
 
 
-def _implicit(patches: _Patches, theta: Tensor, scale: Tensor, converged: Tensor) -> Tensor:
-    """Theta with its gradient by both images: one Newton step from the solution has the exact one."""
+def _implicit(patches: _Patches, still: _Patches, theta: Tensor, scale: Tensor, converged: Tensor) -> Tensor:
+    """Theta with its gradient by both images: one Newton step from the solution has the exact one.
+
+    `still`: the same patches without a gradient.
+    """
     with torch.enable_grad():
         free = theta.detach().requires_grad_()
-        fixed = patches._replace(
-            template=patches.template.detach(), right=patches.right._replace(values=patches.right.values.detach())
-        )
-        balance = _balance(fixed, free, scale)
+        balance = _balance(still, free, scale)
         rows = [torch.autograd.grad(balance[:, i].sum(), free, retain_graph=True)[0] for i in range(theta.shape[1])]
     jacobian = torch.stack(rows, 1)
     jacobian = torch.where(converged[:, None, None], jacobian, torch.eye(theta.shape[1]).to(jacobian))

@@ -157,13 +157,12 @@ def marker_board(picture: npt.NDArray[np.uint8], seen: SeenMarkers) -> SeenBoard
             tags = np.stack([_at_squares(picture, one) for one in image[good]]) if kind == "aprilgrid" else image[good]
             side = _sides(np.asarray(found, np.float64), tags)
             rows = np.abs(places[good][:, 1])
-            columns = across - 1 if kind == "charuco" else across
             low, high = int(rows.min()), int(rows.max()) + 1
             most = int(good.sum())
             if kind == "charuco":
-                best = SeenBoard(kind, columns, (low, high - 1), seen.dictionary, side)
+                best = SeenBoard(kind, across - 1, (low, high - 1), seen.dictionary, side)
             else:
-                best = SeenBoard(kind, columns, (low, high), share=1.0 / side - 1.0)
+                best = SeenBoard(kind, across, (low, high), share=1.0 / side - 1.0)
     return best
 
 

@@ -29,11 +29,7 @@ _OPENCV_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 
 
 def refine_corners(
-    image: Gray,
-    pixels: Tensor,
-    side: Tensor,
-    method: Refinement = "erf",
-    grid: tuple[int, int] | None = None,
+    image: Gray, pixels: Tensor, side: Tensor, method: Refinement = "erf", grid: tuple[int, int] | None = None
 ) -> saddles.Refined:
     """Refine corners to a fraction of a pixel.
 

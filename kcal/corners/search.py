@@ -12,23 +12,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+import kcal.corners.grid as grids
 from kcal.corners.board import Board
-from kcal.corners.grid import (
-    MIN_OUTER,
-    MIN_SQUARE,
-    as_grid,
-    checkered,
-    contrast,
-    first_square_dark,
-    goes_on,
-    grid_trouble,
-    in_image,
-    levels_beside,
-    local_side,
-    sides,
-    sound_grid,
-    step_along,
-)
 from kcal.corners.images import Gray
 from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import CornerStatus, saddle
@@ -71,14 +56,14 @@ def canonical_order(image: npt.NDArray[np.generic], pixels: Tensor, board: Board
         >>> bool((canonical_order(image, corners.flip(0), board) == corners).all())
         True
     """
-    grid = as_grid(pixels, board.columns, board.rows)
+    grid = grids.as_grid(pixels, board.columns, board.rows)
     if handedness(grid) < 0:
         grid = grid.flip(1)
     turns = [grid, grid.flip(0, 1)]
     if board.columns == board.rows:
         quarter = grid.transpose(0, 1).flip(1)
         turns += [quarter, quarter.flip(0, 1)]
-    dark = [turn for turn in turns if first_square_dark(image, turn)[0]]
+    dark = [turn for turn in turns if grids.first_square_dark(image, turn)[0]]
     return max(dark or turns, key=uprightness).reshape(-1, 2)
 
 
@@ -145,7 +130,7 @@ def _extended(image: npt.NDArray[np.generic], light: Tensor, grid: Tensor, free:
     side = torch.minimum(torch.linalg.vector_norm(along, dim=-1), torch.linalg.vector_norm(down, dim=-1))
     refined = saddle(light, places, (free * side).clamp_min(1.0))
     apart = torch.linalg.vector_norm(refined.pixels - places, dim=-1)
-    good = (refined.status == CornerStatus.GOOD) & (side >= MIN_SQUARE) & (apart < MAX_MISS * side)
+    good = (refined.status == CornerStatus.GOOD) & (side >= grids.MIN_SQUARE) & (apart < MAX_MISS * side)
     good &= _are_corners(image, grid, refined.pixels, free * along, free * down, new, free)
     grid = grid.clone()
     grid[new] = torch.where(good[:, None], refined.pixels, torch.nan)
@@ -171,7 +156,7 @@ def _predicted(grid: Tensor) -> Tensor:
     third: list[Tensor] = []
     second: list[Tensor] = []
     for side in range(4):
-        turned = sides(grid)[side]
+        turned = grids.sides(grid)[side]
         padded = torch.nn.functional.pad(turned, (0, 0, 0, 0, 0, 3), value=torch.nan)
         one, two, three = (padded[k : k + len(turned)] for k in (1, 2, 3))
         for values, guess in ((third, 3 * one - 3 * two + three), (second, 2 * one - two)):
@@ -183,28 +168,22 @@ def _predicted(grid: Tensor) -> Tensor:
 
 
 def _are_corners(
-    image: npt.NDArray[np.generic],
-    grid: Tensor,
-    places: Tensor,
-    along: Tensor,
-    down: Tensor,
-    new: Tensor,
-    free: float,
+    image: npt.NDArray[np.generic], grid: Tensor, places: Tensor, along: Tensor, down: Tensor, new: Tensor, free: float
 ) -> Tensor:
     """Whether squares alternate on all four sides of new places (N, 2), in step with the corners known in `grid`."""
-    known = contrast(image, grid, *(free * step for step in local_steps(grid))) / 2 * checkered(grid)
+    known = grids.contrast(image, grid, *(free * step for step in local_steps(grid))) / 2 * grids.checkered(grid)
     around = torch.nn.functional.pad(known, (2, 2, 2, 2), value=torch.nan)
     near = [around[i : i + known.shape[0], j : j + known.shape[1]] for i in range(5) for j in range(5)]
-    typical = torch.stack(near).nanmedian(0).values[new] * checkered(grid)[new]
+    typical = torch.stack(near).nanmedian(0).values[new] * grids.checkered(grid)[new]
     four = torch.stack(
         [
-            step_along(image, places, along, down),
-            -step_along(image, places, along, -down),
-            step_along(image, places, down, along),
-            -step_along(image, places, down, -along),
+            grids.step_along(image, places, along, down),
+            -grids.step_along(image, places, along, -down),
+            grids.step_along(image, places, down, along),
+            -grids.step_along(image, places, down, -along),
         ]
     ) / torch.where(typical == 0, torch.nan, typical)
-    return (four.amin(0) > MIN_OUTER * four.amax(0)) & (four.mean(0) > MIN_CONTRAST)
+    return (four.amin(0) > grids.MIN_OUTER * four.amax(0)) & (four.mean(0) > MIN_CONTRAST)
 
 
 # Find a part of a checkerboard, where it is certain which part it is.
@@ -255,7 +234,7 @@ def find_part(
     """
     best = best or FoundBoard(None)
     for seed in seeds:
-        whole = sound_grid(image, seed)
+        whole = grids.sound_grid(image, seed)
         if whole is None:
             continue
         part = _grown(image, whole.flip(1) if handedness(whole) < 0 else whole, board)
@@ -283,7 +262,7 @@ def _grown(image: npt.NDArray[np.uint8], seed: Tensor, board: Board) -> FoundBoa
         )
     if max(high, wide) > longer or min(high, wide) > shorter:
         return FoundBoard(None, f"a grid of {size} inner corners was found, larger than {asked}", seen, other=True)
-    if goes_on(image, grid):
+    if grids.goes_on(image, grid):
         return FoundBoard(None, f"the squares go on beyond the {size} inner corners that were found", seen)
     places = _placements(image, grid, ends, board)
     if not places:
@@ -310,19 +289,19 @@ def board_ends(image: npt.NDArray[np.generic], grid: Tensor, paper: bool = False
     The outer squares must alternate up to one step outside the outer corners, and nothing may alternate beyond. With
     `paper` it must be light there as well: what covers a board along a straight line seldom is.
     """
-    top, bottom, left, right = (_is_end(image, side, paper) for side in sides(grid))
+    top, bottom, left, right = (_is_end(image, side, paper) for side in grids.sides(grid))
     return top, bottom, left, right
 
 
 def _is_end(image: npt.NDArray[np.generic], grid: Tensor, paper: bool) -> bool:
     beyond, out, along = _next_line(grid)
     own, inner, outer = (
-        step_along(image, places, along, down) for places, down in ((grid[0], out), (beyond, -out), (beyond, out))
+        grids.step_along(image, places, along, down) for places, down in ((grid[0], out), (beyond, -out), (beyond, out))
     )
-    usable = in_image(image, beyond + 0.5 * out) & torch.isfinite(own + inner + outer)
-    ends = (inner / own > OUTER_SQUARE) & (outer.abs() < MIN_OUTER * inner.abs())
+    usable = grids.in_image(image, beyond + 0.5 * out) & torch.isfinite(own + inner + outer)
+    ends = (inner / own > OUTER_SQUARE) & (outer.abs() < grids.MIN_OUTER * inner.abs())
     if paper:
-        square, ground = (levels_beside(image, beyond, along, down) for down in (-out, out))
+        square, ground = (grids.levels_beside(image, beyond, along, down) for down in (-out, out))
         ends &= ground.amin(0) > square.mean(0)
     count = int(usable.sum())
     return count >= MIN_END and int((ends & usable).sum()) >= MIN_END_SHARE * count
@@ -345,7 +324,7 @@ def _placements(
     top, bottom, left, right = ends
     for _ in range(4):
         high, wide = grid.shape[:2]
-        lighter = contrast(image, grid, *local_steps(grid)) * checkered(grid)
+        lighter = grids.contrast(image, grid, *local_steps(grid)) * grids.checkered(grid)
         dark = bool(lighter.nanmedian() < 0)  # the square diagonally outside the grid's first corner
         for row in range(board.rows - high + 1):
             for column in range(board.columns - wide + 1):
@@ -366,14 +345,14 @@ def _hidden_sides(image: npt.NDArray[np.generic], grid: Tensor, ends: tuple[bool
     middle = grid.nanmean((0, 1))
     cut: list[str] = []
     unclear: list[str] = []
-    for side, end in zip(sides(grid), ends, strict=True):
+    for side, end in zip(grids.sides(grid), ends, strict=True):
         if end:
             continue
         beyond, out, _ = _next_line(side)
         x, y = (side[0].nanmean(0) - middle).tolist()
         name = ("right" if x > 0 else "left") if abs(x) > abs(y) else ("bottom" if y > 0 else "top")
         known = torch.isfinite(beyond + out).all(-1)
-        outside = known & ~in_image(image, beyond + 0.5 * out)
+        outside = known & ~grids.in_image(image, beyond + 0.5 * out)
         (cut if 2 * int(outside.sum()) >= int(known.sum()) else unclear).append(name)
     texts = []
     if cut:
@@ -411,14 +390,14 @@ def find_board(image: npt.NDArray[np.uint8], board: Board) -> FoundBoard:
     whole = _find_whole(searches[:1], board)
     if whole.pixels is not None:
         return whole
-    grids = seeds(small)
-    part = find_part(small, board, itertools.islice(grids, 1))
+    candidates = seeds(small)
+    part = find_part(small, board, itertools.islice(candidates, 1))
     if not _is_all(small, part, board):
         found = _find_whole(searches[1:], board)
         if found.pixels is not None:
             return found
         whole = found if whole.rejected is None else whole
-        part = part if part.pixels is not None else find_part(small, board, grids, part)
+        part = part if part.pixels is not None else find_part(small, board, candidates, part)
     if part.pixels is not None:
         return FoundBoard(to_full_size(part.pixels, scale), factor=factor)
     if part.rejected is not None and (part.other or whole.rejected is None):
@@ -437,7 +416,7 @@ def _find_whole(searches: Sequence[_Search], board: Board) -> FoundBoard:
         corners = find(small, board)
         if corners is None:
             continue
-        trouble = grid_trouble(small, corners, board.columns, board.rows)
+        trouble = grids.grid_trouble(small, corners, board.columns, board.rows)
         if trouble is None:
             return FoundBoard(to_full_size(canonical_order(small, corners, board), scale), factor=factor)
         if missing.rejected is None:
@@ -455,7 +434,7 @@ def _is_all(image: npt.NDArray[np.uint8], part: FoundBoard, board: Board) -> boo
     if seen.all() or image_from_board is None:
         return bool(seen.all())
     there = torch.from_numpy(cv2.perspectiveTransform(plane[None, ~seen], image_from_board)[0])
-    return not bool(in_image(image, there).all())
+    return not bool(grids.in_image(image, there).all())
 
 
 def refine_through_sizes(image: Gray, pixels: Tensor, board: Board, factor: float) -> Tensor:
@@ -477,7 +456,7 @@ def refine_through_sizes(image: Gray, pixels: Tensor, board: Board, factor: floa
         steps.append((source, scale))
     for small, scale in reversed(steps):
         start = (pixels + 0.5) / scale - 0.5
-        side = local_side(start, board.columns, board.rows)
+        side = grids.local_side(start, board.columns, board.rows)
         refined = refine_corners(small, start, side, "saddle")
         good = ((refined.status == CornerStatus.GOOD) & (side >= MIN_REFINED_SIDE))[:, None]
         pixels = to_full_size(torch.where(good, refined.pixels, start), scale)

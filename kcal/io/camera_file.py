@@ -188,10 +188,7 @@ def provenance() -> dict[str, Any]:
         >>> sorted(provenance())
         ['created', 'kcal_version']
     """
-    return {
-        "kcal_version": kcal.__version__,
-        "created": datetime.datetime.now(datetime.UTC).replace(microsecond=0),
-    }
+    return {"kcal_version": kcal.__version__, "created": datetime.datetime.now(datetime.UTC).replace(microsecond=0)}
 
 
 def camera_to_file(
@@ -249,11 +246,6 @@ def camera_to_file(
             setting=known.setting if setting is None else setting,
         )
     return file.model_copy(update={"summary": CameraSummary.made(camera, file.model_dump(mode="json"))})
-
-
-def named_camera_file(camera: Camera, otherwise: str) -> CameraFile:
-    """The file of a camera, with the name `otherwise` if the camera has none."""
-    return camera_to_file(camera, name=(camera.calibration or CameraCalibration()).name or otherwise)
 
 
 def save_camera(camera: Camera, path: str | Path, *, name: str | None = None) -> Path:

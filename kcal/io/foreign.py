@@ -107,9 +107,7 @@ def rig_poses(rig: Rig) -> tuple[Pose, ...]:
     return tuple(map(Pose, rig.rotation, rig.translation))
 
 
-def each_readable(
-    readers: Iterable[tuple[str, Callable[[], Camera]]],
-) -> tuple[tuple[Camera, ...], dict[str, str]]:
+def each_readable(readers: Iterable[tuple[str, Callable[[], Camera]]]) -> tuple[tuple[Camera, ...], dict[str, str]]:
     """The cameras that can be read, and why the others, by name, cannot.
 
     Raises:

@@ -24,6 +24,7 @@ from kcal.io.foreign import (
     checked_pose,
     core_of,
     dump_yaml,
+    flat,
     ini_sections,
     known_size,
     named_camera,
@@ -34,7 +35,7 @@ from kcal.io.foreign import (
     with_sigmas,
 )
 from kcal.io.foreign_lenses import nearest_hybrid
-from kcal.io.keyed import flat, read_keyed
+from kcal.io.keyed import read_keyed
 from kcal.lens.camera import Camera
 from kcal.lens.model import LensModel
 from kcal.lens.pose import Pose, vector_from_rotation

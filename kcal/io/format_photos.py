@@ -71,22 +71,15 @@ def _agisoft_camera(sensor: Element, number: int, notes: list[str]) -> Camera:
         )
     own = _FISHEYE if kind == "fisheye" else _FRAME
     size = best.find("resolution")
-    if size is not None:
-        width, height = foreign.whole_size(size.get("width"), size.get("height"))
-    else:
-        width, height = foreign.whole_size(best.findtext("width"), best.findtext("height"))
+    stated = best.findtext if size is None else size.get
+    width, height = foreign.whole_size(stated("width"), stated("height"))
     given = {tag: foreign.numbers([best.findtext(tag, "0")], 1, tag)[0] for tag in (*_FRAME, *_OTHERS)}
     if kind == "fisheye":
         model = LensModel.named("fisheye4")
     else:
         model = LensModel(numerator=4, tangential=True) if given["k4"] else LensModel.named("opencv5")
     names = ("fx", "fy", "cx", "cy", "skew", *model.names)
-    values = dict.fromkeys(names, 0.0)
-    for tag, changed in own.items():
-        for target in changed:
-            if target in values:
-                values[target] += given[tag]
-    fx, fy, cx, cy, skew, *lens = values.values()
+    fx, fy, cx, cy, skew, *lens = (sum((given[tag] for tag in own if name in own[tag]), 0.0) for name in names)
     core = (fx, fy, cx + 0.5 * width - 0.5, cy + 0.5 * height - 0.5)
     kinds = {"frame": "frame with p3, p4", "fisheye": "fisheye with p1 to p4", "equisolid_fisheye": "equisolid fisheye"}
     if kind == "equisolid_fisheye" or any(value for tag, value in given.items() if tag not in own):
@@ -111,16 +104,12 @@ def _sensor_covariance(sensor: Element, own: dict[str, tuple[str, ...]], names: 
     if not tags or len(tags) > len(own) or strange:
         raise ValueError(f"covariance: its parameters are {' '.join(tags)[:80]!r}")
     matrix = foreign.numbers((stated.findtext("coeffs") or "").split(), len(tags) ** 2, "covariance")
-    moved = torch.zeros(len(names), len(tags), dtype=torch.float64)
-    for column, tag in enumerate(tags):
-        for target in own[tag]:
-            if target in names:
-                moved[names.index(target), column] = 1.0
+    moved = torch.tensor([[name in own[tag] for tag in tags] for name in names], dtype=torch.float64)
     spread = torch.tensor(matrix, dtype=torch.float64).reshape(len(tags), len(tags))
     return moved @ (0.5 * (spread + spread.T)) @ moved.T
 
 
-# COLMAP's `cameras.txt` and `cameras.bin`. Pixel (0.5, 0.5) is the center of the first pixel there.
+# COLMAP's `cameras.txt` and `cameras.bin`.
 
 # Pixel (0.5, 0.5) is the center of the first pixel in files of COLMAP and nerfstudio.
 _HALF = 0.5
@@ -259,7 +248,10 @@ def _sensors_of(take: Callable[[str], Any]) -> dict[int, Sequence[float]]:
 
 
 def _colmap_camera(number: int, name: str, size: tuple[int, int], values: Sequence[float], notes: list[str]) -> Camera:
-    known = _known(name)
+    known = COLMAP_MODELS.get(name)
+    if known is None or not known.model:
+        readable = ", ".join(name for name, model in COLMAP_MODELS.items() if model.model)
+        raise ValueError(f"camera model {name}: kcal reads {readable}")
     given = dict(zip(known.parameters, values, strict=True))
     fx = given.pop("fx", None) or given["f"]
     fy = given.pop("fy", None) or given.pop("f")
@@ -270,15 +262,7 @@ def _colmap_camera(number: int, name: str, size: tuple[int, int], values: Sequen
     return foreign_camera(known.model, str(number), (fx, fy, cx, cy), size, own, notes)
 
 
-def _known(name: str) -> ColmapModel:
-    known = COLMAP_MODELS.get(name)
-    if known is None or not known.model:
-        readable = ", ".join(name for name, model in COLMAP_MODELS.items() if model.model)
-        raise ValueError(f"camera model {name}: kcal reads {readable}")
-    return known
-
-
-def _from_text(path: Path) -> list[tuple[int, str, tuple[int, int], list[float]]]:
+def _from_text(path: Path) -> Entries:
     entries = []
     for number, line in enumerate(read_text(path, foreign.MOST_BYTES).splitlines(), 1):
         fields = line.split()
@@ -296,7 +280,7 @@ def _from_text(path: Path) -> list[tuple[int, str, tuple[int, int], list[float]]
     return entries
 
 
-def _from_binary(data: bytes) -> list[tuple[int, str, tuple[int, int], list[float]]]:
+def _from_binary(data: bytes) -> Entries:
     by_number = {known.number: name for name, known in COLMAP_MODELS.items()}
     try:
         (count,), place, entries = struct.unpack_from("<Q", data), 8, []
@@ -417,15 +401,9 @@ def _nerfstudio_camera(values: dict[str, Any], name: str, hints: foreign.Hints) 
         raise ValueError(f"{', '.join(stray)}: {'a fisheye' if fisheye else 'a lens of nerfstudio'} has no such term")
     # kcal's name for a fourth radial coefficient; k4 is a denominator's.
     lens = given | {"k7": given.get("k4", 0.0)}
-    if fisheye:
-        model = LensModel.named("fisheye4")
-    elif lens["k7"]:
-        model = LensModel(numerator=4, tangential=True)
-    elif lens.get("k3"):
-        model = LensModel.named("opencv5")
-    else:
-        bent = any(lens.get(key) for key in ("k1", "k2", "p1", "p2")) or kind not in ("PINHOLE", "SIMPLE_PINHOLE")
-        model = LensModel.named("opencv4" if bent else "pinhole")
+    bent = any(lens.get(key) for key in ("k1", "k2", "p1", "p2")) or kind not in ("PINHOLE", "SIMPLE_PINHOLE")
+    known = "fisheye4" if fisheye else "opencv5" if lens.get("k3") else "opencv4" if bent else "pinhole"
+    model = LensModel(numerator=4, tangential=True) if lens["k7"] and not fisheye else LensModel.named(known)
     terms = [lens.get(key, 0.0) for key in model.names]
     return foreign.named_camera(name, (fx or fy, fy or fx, *center), size, model, terms)
 

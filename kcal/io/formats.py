@@ -16,24 +16,9 @@ import torch
 from kcal.errors import FileError, InputError
 from kcal.file_kind import file_kind, is_image
 from kcal.files import read_bytes, read_head, read_text
-from kcal.io import (
-    format_bag,
-    format_devices,
-    format_kalibr,
-    format_mrcal,
-    format_opencv,
-    format_photos,
-    format_prior,
-)
+from kcal.io import format_bag, format_devices, format_kalibr, format_mrcal, format_opencv, format_photos, format_prior
 from kcal.io.camera_file import load_camera
-from kcal.io.foreign import (
-    MOST_BYTES,
-    Hints,
-    ImportedCameras,
-    camera_name,
-    reading,
-    rig_poses,
-)
+from kcal.io.foreign import MOST_BYTES, Hints, ImportedCameras, camera_name, reading, rig_poses
 from kcal.io.keyed import speaks_of_camera
 from kcal.io.rig_file import load_rig
 from kcal.lens.camera import Camera

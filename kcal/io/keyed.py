@@ -14,24 +14,7 @@ from typing import Any
 import torch
 from torch.nn.functional import pad
 
-from kcal.io.foreign import (
-    BEFORE,
-    Hints,
-    ImportedCameras,
-    Keys,
-    bare,
-    camera_name,
-    checked_pose,
-    core_of,
-    each_readable,
-    flat,
-    known_size,
-    named_camera,
-    numbers,
-    plain,
-    whole_size,
-    with_sigmas,
-)
+import kcal.io.foreign as foreign
 from kcal.io.foreign_lenses import foreign_camera, nearest_hybrid
 from kcal.lens.camera import Camera
 from kcal.lens.camera_conversions import OPENCV_MODELS, ImageTransform
@@ -81,10 +64,10 @@ _REALSENSE = {"inversebrownconrady": "inverse", "modifiedbrownconrady": "modifie
 
 def _role(key: str, value: Any) -> tuple[str, str] | None:
     """What a key of a camera means, and the side of the rig that it names."""
-    name, found = bare(key), flat(value)
+    name, found = foreign.bare(key), foreign.flat(value)
     count = len(found) if found is not None else -1
     many = isinstance(value, list | tuple | Mapping) or hasattr(value, "tolist")
-    before, after = BEFORE.fullmatch(name), _AFTER.fullmatch(name)
+    before, after = foreign.BEFORE.fullmatch(name), _AFTER.fullmatch(name)
     ways = [(name, ""), (before and before[2], before and before[1]), (after and after[1], after and after[2])]
     for base, side in ways:
         for role, pattern in _PATTERNS.items():
@@ -98,20 +81,16 @@ class _Named:
     """Values of cameras by (role, side), with the key of each."""
 
     def __init__(self, content: Mapping[str, Any]) -> None:
-        self.keys, self.at = Keys(content), dict[tuple[str, str], str]()
+        self.keys, self.at = foreign.Keys(content), dict[tuple[str, str], str]()
         for key, value in content.items():
             role = _role(key, value)
             if role is None or (role[0] == "kind" and not isinstance(value, str)):
                 continue
             if (other := self.at.get(role)) is not None and role[0] not in ("kind", "rotation", "translation"):
-                if flat(content[other]) != flat(value):
+                if foreign.flat(content[other]) != foreign.flat(value):
                     raise ValueError(f"{other} and {key} are both there and differ; delete the one that is not meant")
                 self.keys[key]
             self.at.setdefault((f"kind {key}", role[1]) if role[0] == "kind" else role, key)
-
-    def sides(self) -> list[str]:
-        """The sides that have a camera."""
-        return sorted({side for role, side in self.at if role in ("matrix", "fx", "f")})
 
     def get(self, role: str, side: str = "") -> Any:
         """The value for a side, else the one for all sides; None if there is neither."""
@@ -125,21 +104,21 @@ class _Named:
     def number(self, role: str, side: str, otherwise: float = 0.0) -> float:
         """The value as a number; `otherwise` if there is none."""
         found = self.get(role, side)
-        return otherwise if found is None else numbers(found, 1, self.key(role, side))[0]
+        return otherwise if found is None else foreign.numbers(found, 1, self.key(role, side))[0]
 
     def size(self, side: str) -> tuple[int, int] | None:
         """(width, height) as stated."""
         both = [self.get("width", side), self.get("height", side)]
         if None in both:
             both = self.get("size", side)
-        return None if both is None else whole_size(*numbers(both, 2, "the image size"))
+        return None if both is None else foreign.whole_size(*foreign.numbers(both, 2, "the image size"))
 
     def core(self, side: str) -> tuple[list[float], float]:
         """fx, fy, cx, cy, and the skew in the matrix."""
         if (matrix := self.get("matrix", side)) is not None:
-            found, key = flat(matrix) or [], self.key("matrix", side)
+            found, key = foreign.flat(matrix) or [], self.key("matrix", side)
             # Four numbers that are called intrinsics are fx, fy, cx, cy.
-            return (found, 0.0) if len(found) == 4 and "intrin" in bare(key) else core_of(found, key)
+            return (found, 0.0) if len(found) == 4 and "intrin" in foreign.bare(key) else foreign.core_of(found, key)
         fx = self.number("fx", side) or self.number("f", side)
         if missing := [name for name in ("cx", "cy") if self.get(name, side) is None]:
             raise ValueError(f"{' and '.join(missing)} of the principal point are missing")
@@ -152,12 +131,12 @@ class _Named:
             ValueError: a lens that is neither, or keys that contradict each other.
         """
         said: dict[bool, str] = {}
-        bent = any(flat(self.get("lens", side)) or [])
+        bent = any(foreign.flat(self.get("lens", side)) or [])
         for (role, where), key in self.at.items():
             if where not in ("", side) or role.split()[0] not in ("kind", "fisheye"):
                 continue
             value = self.keys[key]
-            text = re.sub("^(?:(?:rs2)?distortion|lensmodel)", "", bare(value))
+            text = re.sub("^(?:(?:rs2)?distortion|lensmodel)", "", foreign.bare(value))
             if role == "fisheye":
                 said[value not in (0, "0", "no", "No") and text not in ("false", "00")] = key
             elif text in _REALSENSE and bent and fisheye is None:
@@ -168,7 +147,7 @@ class _Named:
                 raise ValueError(f"{key} {value}, but there are coefficients that are not zero; delete one of them")
             elif _EITHER.fullmatch(text) or (_OMNI.fullmatch(text) and ("xi", side) in self.at) or fisheye is not None:
                 continue
-            elif bare(key) in ("type", "model", "cameratype", "cameramodel") and not _FOREIGN.match(text):
+            elif foreign.bare(key) in ("type", "model", "cameratype", "cameramodel") and not _FOREIGN.match(text):
                 notes.append(f"{key} {value}: no name of a lens model; not read")
             else:
                 raise ValueError(
@@ -187,16 +166,16 @@ def has_camera(content: Mapping[str, Any]) -> bool:
 
 def speaks_of_camera(text: str) -> bool:
     """Whether a text has such keys at the beginning of its lines."""
-    names = map(bare, re.findall(r"^[ \t\"'{-]*+([A-Za-z][\w. -]{0,40}?)[\"']?[ \t]*[:=]", text, re.MULTILINE))
+    names = map(foreign.bare, re.findall(r"^[ \t\"'{-]*+([A-Za-z][\w. -]{0,40}?)[\"']?[ \t]*[:=]", text, re.MULTILINE))
     return any(
         pattern.fullmatch(base)
         for name in names
-        for base in (name, (BEFORE.fullmatch(name) or ("", "", ""))[2], (_AFTER.fullmatch(name) or ("", ""))[1])
+        for base in (name, (foreign.BEFORE.fullmatch(name) or ("", "", ""))[2], (_AFTER.fullmatch(name) or ("", ""))[1])
         for pattern in (_PATTERNS["matrix"], _PATTERNS["fx"])
     )
 
 
-def read_keyed(content: Mapping[str, Any], name: str, hints: Hints, title: str) -> ImportedCameras:
+def read_keyed(content: Mapping[str, Any], name: str, hints: foreign.Hints, title: str) -> foreign.ImportedCameras:
     """Read the cameras of a mapping: one, several whose keys name a side, or those of mappings inside it.
 
     Poses are those of each camera, or R and T of the second one of two.
@@ -207,7 +186,7 @@ def read_keyed(content: Mapping[str, Any], name: str, hints: Hints, title: str) 
     notes: list[str] = []
     inside = _cameras_inside(content)
     if inside:
-        outer = {key: value for key, value in content.items() if key not in inside and bare(key) != "cameras"}
+        outer = {key: value for key, value in content.items() if key not in inside and foreign.bare(key) != "cameras"}
         named = _Named(outer)
         shared = {key: named.keys[key] for (role, _), key in named.at.items() if role in ("width", "height", "size")}
         parts = {
@@ -218,10 +197,10 @@ def read_keyed(content: Mapping[str, Any], name: str, hints: Hints, title: str) 
         }  # fmt: skip
     else:
         named = _Named(_flattened(content))
-        sides = named.sides()
+        sides = sorted({side for role, side in named.at if role in ("matrix", "fx", "f")})
         labels = ["left", "right"] if len(sides) == 2 else [f"camera{side}" for side in sides]
         parts = {label if len(sides) > 1 else name: (named, side) for label, side in zip(labels, sides, strict=True)}
-    cameras, refused = each_readable(
+    cameras, refused = foreign.each_readable(
         (label, partial(_camera, *part, label, hints, notes)) for label, part in parts.items()
     )
     poses = _poses(named, list(parts.values()), hints, notes)
@@ -232,7 +211,7 @@ def read_keyed(content: Mapping[str, Any], name: str, hints: Hints, title: str) 
         poses = tuple(pose for pose, label in zip(poses, parts, strict=True) if label not in refused)
     for whole in {id(part): part for part, _ in [*parts.values(), (named, "")]}.values():
         notes += whole.keys.rest()
-    return ImportedCameras(
+    return foreign.ImportedCameras(
         format=title, cameras=cameras, poses=poses, notes=tuple(dict.fromkeys(notes)), unread=refused
     )
 
@@ -242,12 +221,12 @@ def _cameras_inside(content: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     if has_camera(content):
         return {}
     tables = dict(content)
-    inside: Any = next((tables.pop(key) for key in list(tables) if bare(key) == "cameras"), {})
+    inside: Any = next((tables.pop(key) for key in list(tables) if foreign.bare(key) == "cameras"), {})
     if isinstance(inside, list):
         inside = {str(i): part for i, part in enumerate(inside)}
     inside = inside if isinstance(inside, Mapping) else {}
     # Blocks such as `projection_parameters` are parts of one camera.
-    own = {key: part for key, part in tables.items() if not re.search("param|intrin|proj", bare(key))}
+    own = {key: part for key, part in tables.items() if not re.search("param|intrin|proj", foreign.bare(key))}
     return {
         str(key): part for key, part in (own | inside).items()
         if isinstance(part, Mapping) and "data" not in part and has_camera(_flattened(part))
@@ -260,7 +239,7 @@ def _flattened(content: Mapping[str, Any]) -> dict[str, Any]:
     for key, value in content.items():
         block = isinstance(value, Mapping) and "data" not in value and _role(key, value) is None
         # PhotonVision's board has a size, too.
-        block = block and "object" not in bare(key)
+        block = block and "object" not in foreign.bare(key)
         if block and any(map(_role, value, value.values())):
             if twice := set(found) & set(value):
                 raise ValueError(
@@ -275,17 +254,19 @@ def _flattened(content: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _camera(named: _Named, side: str, name: str, hints: Hints, notes: list[str]) -> Camera:
+def _camera(named: _Named, side: str, name: str, hints: foreign.Hints, notes: list[str]) -> Camera:
     stated_size = named.size(side)
-    size = known_size(hints.size or stated_size)
+    size = foreign.known_size(hints.size or stated_size)
     core, skew = named.core(side)
     matrix = named.key("matrix", side)
     fisheye = named.kind(side, hints.fisheye, notes)
     stated = named.get("lens", side)
-    lens = _coefficients(named, side, fisheye is True) if stated is None else (flat(stated) or [])
+    lens = _coefficients(named, side, fisheye is True) if stated is None else (foreign.flat(stated) or [])
     key = named.key("lens", side) if stated is not None else "the coefficients k1, k2, p1, p2"
     if isinstance(fisheye, str):
-        return _realsense_lens(fisheye, named_camera(name, core, size, "pinhole"), numbers(lens, 5, key), notes)
+        return _realsense_lens(
+            fisheye, foreign.named_camera(name, core, size, "pinhole"), foreign.numbers(lens, 5, key), notes
+        )
     if fisheye and len(lens) > 4 and not any(lens[4:]):
         lens = lens[:4]
     if named.get("xi", side) is not None:
@@ -294,7 +275,7 @@ def _camera(named: _Named, side: str, name: str, hints: Hints, notes: list[str])
         return foreign_camera("omni-radtan", name, core, size, [named.number("xi", side), *lens], notes)
     if fisheye and lens and len(lens) != 4:
         raise ValueError(f"a fisheye has 4 coefficients, {key} has {len(lens)}")
-    lens = numbers(lens, (4,) if fisheye and lens else tuple(OPENCV_MODELS), key)
+    lens = foreign.numbers(lens, (4,) if fisheye and lens else tuple(OPENCV_MODELS), key)
     if fisheye is None and len(lens) == 4 and stated is not None:
         notes.append("4 coefficients read as k1 k2 p1 p2; if they are a fisheye's, use --fisheye")
     if not lens:
@@ -304,17 +285,17 @@ def _camera(named: _Named, side: str, name: str, hints: Hints, notes: list[str])
         skew = 0.0
     skew = skew or named.number("skew", side)
     model = "fisheye4" if fisheye else OPENCV_MODELS[len(lens)]
-    camera = named_camera(name, core, size, model, lens or [0.0] * 4 * bool(fisheye), skew)
+    camera = foreign.named_camera(name, core, size, model, lens or [0.0] * 4 * bool(fisheye), skew)
     if (sigmas := named.get("sigmas")) is not None and not side:
         # OpenCV always states those of 14 coefficients.
-        given = numbers(sigmas, (4 + len(lens), 18), named.key("sigmas", side))
-        notes.append(with_sigmas(camera, given[: 4 + len(lens)]))
+        given = foreign.numbers(sigmas, (4 + len(lens), 18), named.key("sigmas", side))
+        notes.append(foreign.with_sigmas(camera, given[: 4 + len(lens)]))
     return camera if hints.size else _delivered(named, side, camera, notes)
 
 
 def _realsense_lens(kind: str, like: Camera, lens: list[float], notes: list[str]) -> Camera:
     """A lens of librealsense: its inverse one says where the ray of a distorted point is, as its documentation says."""
-    name = camera_name(like, "camera")
+    name = foreign.camera_name(like, "camera")
     if kind != "inverse":
         if kind == "fov" and any(lens[1:]):
             raise ValueError("ftheta with more than one coefficient, which is not RealSense's: kcal does not read it")
@@ -359,13 +340,17 @@ def _delivered(named: _Named, side: str, camera: Camera, notes: list[str]) -> Ca
         notes.append(
             f"the principal point ({cx:g}, {cy:g}) is in the middle of {images}: taken as that of these images"
         )
-        return named_camera(camera_name(camera, ""), (fx, fy, cx, cy), (wide, high), camera.model, lens, skew)
+        return foreign.named_camera(
+            foreign.camera_name(camera, ""), (fx, fy, cx, cy), (wide, high), camera.model, lens, skew
+        )
     notes.append(f"the camera is that of {images}")
     cut = camera.cropped(left, top, (wide * bins[0], high * bins[1]))
     return cut.transformed(ImageTransform.resize(cut.size, (wide, high)))
 
 
-def _poses(named: _Named, parts: Sequence[tuple[_Named, str]], hints: Hints, notes: list[str]) -> tuple[Pose, ...]:
+def _poses(
+    named: _Named, parts: Sequence[tuple[_Named, str]], hints: foreign.Hints, notes: list[str]
+) -> tuple[Pose, ...]:
     """Of each camera, or of the second one of two from the first."""
     meters = hints.meters or 1.0
     each = [part.get("rotation", side) is not None and part.get("translation", side) is not None and part is not named
@@ -386,7 +371,7 @@ def _poses(named: _Named, parts: Sequence[tuple[_Named, str]], hints: Hints, not
 
 
 def _pose_of_keys(named: _Named, side: str, meters: float) -> Pose:
-    turn = numbers(named.get("rotation", side), (3, 9), named.key("rotation", side))
-    rotation = plain(rotation_from_vector(torch.tensor(turn, dtype=torch.float64))) if len(turn) == 3 else turn
-    shift = numbers(named.get("translation", side), 3, named.key("translation", side))
-    return checked_pose(rotation, [meters * value for value in shift])
+    turn = foreign.numbers(named.get("rotation", side), (3, 9), named.key("rotation", side))
+    rotation = foreign.plain(rotation_from_vector(torch.tensor(turn, dtype=torch.float64))) if len(turn) == 3 else turn
+    shift = foreign.numbers(named.get("translation", side), 3, named.key("translation", side))
+    return foreign.checked_pose(rotation, [meters * value for value in shift])

@@ -419,9 +419,3 @@ class LensOrders(Record):
         if self.hybrid is None and field is not None:
             raise InputError("a network was given for the field, and this lens has no field; leave it out")
         return LensModel(**dict(self) | {"hybrid": self.hybrid and self.hybrid.form(field)})
-
-
-# What a camera or rig is at a glance, stored in its file for readers that cannot compute it.
-#
-# Derived when the file is written, with a digest of what it was derived from: if a file was changed by hand since, the
-# digest tells, and `kcal show` computes anew. kcal itself reads nothing else from it.

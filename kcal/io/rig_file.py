@@ -21,8 +21,9 @@ from kcal.checks import as_covariance, require_root
 from kcal.dispatch import still
 from kcal.errors import FileError, InputError
 from kcal.gaussian import half_of_covariance
-from kcal.io.camera_file import CameraFile, named_camera_file
+from kcal.io.camera_file import CameraFile, camera_to_file
 from kcal.io.file_summary import RigSummary
+from kcal.io.foreign import camera_name
 from kcal.io.record import Packed
 from kcal.lens.calibration import RigCalibration
 from kcal.lens.pair_errors import relative_root
@@ -307,7 +308,10 @@ def rig_to_file(rig: Rig) -> RigFile:
     with storing("rig"):
         file = RigFile(
             names=rig.names,
-            cameras=tuple(named_camera_file(camera, name) for camera, name in zip(rig.each, rig.names, strict=True)),
+            cameras=tuple(
+                camera_to_file(camera, name=camera_name(camera, name))
+                for camera, name in zip(rig.each, rig.names, strict=True)
+            ),
             poses=tuple(
                 RigPose(rotation=turn, translation=shift)
                 for turn, shift in zip(rig.rotation, rig.translation, strict=True)

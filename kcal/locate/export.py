@@ -560,11 +560,8 @@ def write_positions(path: str | Path, located: Located) -> Path:
         '1,ok'
     """
     check_format(path)
-    check_place(path, located)
-    with open_atomic(path) as file:
-        writer = PositionWriter(file, Path(path).suffix, located)
+    with open_writers([Path(path)], located) as (writer,):
         writer.add(located.columns)
-        writer.close()
     return Path(path)
 
 

@@ -12,6 +12,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+import kcal.locate.stereo as stereo
+import kcal.locate.views as viewing
 from kcal.checks import StatedModule, as_points, as_tensor, chi2_quantile, expanded, scalar
 from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
@@ -23,31 +25,8 @@ from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic,
 from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
 from kcal.locate.mounting import attitude, by_mounting, leveled, station_mounting
-from kcal.locate.stereo import (
-    Localization,
-    PositionStatus,
-    Sensitivity,
-    checked_mask,
-    checked_pair_covariance,
-    checked_pairs,
-    checked_rig,
-    checked_views,
-    checked_views_covariance,
-    flag_positions,
-    joint_covariance,
-    piece_by_piece,
-    reprojection_errors,
-)
-from kcal.locate.views import (
-    CommonErrors,
-    PosedCameras,
-    Reach,
-    ViewsFit,
-    errors_by_camera,
-    fit_pairs,
-    fit_views,
-    reach_of,
-)
+from kcal.locate.stereo import Localization, PositionStatus, Sensitivity
+from kcal.locate.views import CommonErrors, PosedCameras
 from kcal.operation import Operations, shapes_of
 
 Weights = Literal["marks", "all"]
@@ -168,7 +147,7 @@ class Localizer(Operations, Movable, StatedModule):
         if self.weights == "marks":
             if not rig.is_pair:
                 raise InputError('weights "marks": two cameras in the left one\'s frame are needed')
-            checked_rig(rig, pixel_sigma)
+            stereo.checked_rig(rig, pixel_sigma)
             self._stand(rig)
             self._weigh(rig)
             return
@@ -202,7 +181,7 @@ class Localizer(Operations, Movable, StatedModule):
             geodetic = enu_to_geodetic(rig.center.detach(), rig.origin)
             ups = [ecef_from_enu_rotation(lat, lon)[:, 2].to(geodetic) for lat, lon, _ in geodetic.tolist()]
             up, heights = torch.stack(ups) @ self.ecef_from_enu, geodetic[:, 2]
-        errors, bending, self.lens = errors_by_camera(rig)
+        errors, bending, self.lens = viewing.errors_by_camera(rig)
         bending = None if bending is None else bending * self.half_curvature
         freedom = 2.0 * torch.arange(len(rig) + 1, dtype=torch.float64) - 3.0
         limits = torch.stack([chi2_quantile(freedom.clamp_min(1.0), 1.0 - p) for p in (_BAD, _DOUBTFUL)])
@@ -350,15 +329,15 @@ class Localizer(Operations, Movable, StatedModule):
                 raise InputError(
                     f"seen: bool is needed; left and right are pixels of two cameras, and this rig has {count}"
                 )
-            left, right = checked_pairs(pixels, other, self.rig)
+            left, right = stereo.checked_pairs(pixels, other, self.rig)
             if self.weights == "marks" and velocity is None and height is None:
-                return self._of_pairs(left, right, checked_pair_covariance(cov, left), mask)
+                return self._of_pairs(left, right, stereo.checked_covariance(cov, left.shape[:-1], (4, 4), left), mask)
             pixels, other = torch.stack([left, right], -2), None
-        pixels, seen = checked_views(pixels, other, count, like)
+        pixels, seen = stereo.checked_views(pixels, other, count, like)
         lead = pixels.shape[:-2]
         if mask is not None:
-            seen = seen & checked_mask(mask, lead, pixels.device)[..., None]
-        cov = checked_views_covariance(cov, pixels)
+            seen = seen & stereo.checked_mask(mask, lead, pixels.device)[..., None]
+        cov = stereo.checked_covariance(cov, lead, (count, 2, 2))
         if velocity is not None:
             moved = self.clock_sigma * expanded("velocity", as_points("velocity", velocity, 2, pixels), pixels.shape)
             still = torch.eye(2, dtype=torch.float64, device=pixels.device)
@@ -368,7 +347,7 @@ class Localizer(Operations, Movable, StatedModule):
             if height is not None:
                 raise InputError('height: a rig of two cameras uses it with weights="all"')
             left, right = pixels.unbind(-2)
-            cov = None if cov is None else joint_covariance(cov)
+            cov = None if cov is None else stereo.joint_covariance(cov)
             return self._of_pairs(left, right, cov, None if known_true(seen) else seen.all(-1))
         if height is not None:
             if not self.on_earth:
@@ -386,27 +365,29 @@ class Localizer(Operations, Movable, StatedModule):
             return self._checked(pixels, seen, cov, height, (height_sigma, differentiated, ground))
 
         share = 1 if self.errors is None else max(1, count * self.errors.shape[0] // 8)
-        found = piece_by_piece(locate, pixels, seen, cov, heights, differentiated=differentiated, axis=-3, share=share)
+        found = stereo.piece_by_piece(
+            locate, pixels, seen, cov, heights, differentiated=differentiated, axis=-3, share=share
+        )
         return Localization(*(value.reshape(*lead, *value.shape[1:]) for value in found))
 
     def _of_pairs(self, left: Tensor, right: Tensor, cov: Tensor | None, mask: Tensor | None) -> Localization:
         if mask is not None:
-            mask = checked_mask(mask, left.shape[:-1], left.device)
+            mask = stereo.checked_mask(mask, left.shape[:-1], left.device)
         if found := self.as_operation("forward", left, right, cov, mask):
             return Localization(*found)
         differentiated = is_differentiated(left, right, cov, self)
 
         def locate(left: Tensor, right: Tensor, cov: Tensor | None, mask: Tensor | None) -> Localization:
             return self._by_marks(
-                fit_pairs(
+                viewing.fit_pairs(
                     self.rig, left, right, cov, mask, noise=self.pixel_sigma,
                     by_camera=self.calibration_factor is not None, differentiated=differentiated,
                 )
             )  # fmt: skip
 
-        return piece_by_piece(locate, left, right, cov, mask, differentiated=differentiated)
+        return stereo.piece_by_piece(locate, left, right, cov, mask, differentiated=differentiated)
 
-    def _by_marks(self, found: ViewsFit) -> Localization:
+    def _by_marks(self, found: viewing.ViewsFit) -> Localization:
         """Positions of pairs and all their errors."""
         fit, scale = found.fit, found.scale
         spread = [found.variance * entry for entry in fit.covariance]
@@ -416,7 +397,7 @@ class Localizer(Operations, Movable, StatedModule):
             moved, by_link = effect.tensor_split([self.calibration_factor.shape[1]], -2)
             for number, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
                 spread[number] = spread[number] + (moved[..., i, :, :] * moved[..., j, :, :]).sum(-2)
-        reach = reach_of(found, inverse_variance(fit, spread))
+        reach = viewing.reach_of(found, inverse_variance(fit, spread))
         ok = reach.status == int(PositionStatus.OK)
         look = self.enu_from_rig
         bearing = (fit.direction / found.length[..., None, :]).mT @ look.mT
@@ -436,7 +417,9 @@ class Localizer(Operations, Movable, StatedModule):
         bearing = torch.where(there[..., None], bearing, 0.0)
         return self._told(found, reach, (enu, covariance, bearing, found.pair_misfit))
 
-    def _told(self, found: ViewsFit, reach: Reach, positions: tuple[Tensor, Tensor, Tensor, Tensor]) -> Localization:
+    def _told(
+        self, found: viewing.ViewsFit, reach: viewing.Reach, positions: tuple[Tensor, Tensor, Tensor, Tensor]
+    ) -> Localization:
         """The result, given (positions, covariances, bearings, misfits)."""
         enu, covariance, bearing, misfit = positions
         step, ok = self.freed_step, reach.status == int(PositionStatus.OK)
@@ -445,7 +428,7 @@ class Localizer(Operations, Movable, StatedModule):
             covariance=covariance,
             geodetic=self._geodetic(enu if step is None else enu + step[0], ok),
             bearing=bearing,
-            reprojection=reprojection_errors(found.fit.residual),
+            reprojection=stereo.reprojection_errors(found.fit.residual),
             anchor=found.anchor.to(torch.int64).argmax(-1),
             used=found.used,
             bad=torch.zeros_like(found.used),
@@ -494,7 +477,7 @@ class Localizer(Operations, Movable, StatedModule):
             stated = height if ground is None else ground
             if stated is not None:
                 reach = partial(stated_ahead, frame, height=stated, sigma=sigma, differentiated=differentiated)
-        views = fit_views(
+        views = viewing.fit_views(
             posed, pixels, seen, noise=self.pixel_sigma, cov=cov, shared=shared, height=reach,
             differentiated=differentiated,
         )  # fmt: skip
@@ -511,9 +494,9 @@ class Localizer(Operations, Movable, StatedModule):
             bad = chosen & (wrong & ~torn)[..., None]
         return self._by_all(posed, views, falls), bad, torn
 
-    def _by_all(self, posed: PosedCameras, views: ViewsFit, falls: Tensor) -> Localization:
+    def _by_all(self, posed: PosedCameras, views: viewing.ViewsFit, falls: Tensor) -> Localization:
         fit, variance = views.fit, views.variance * inverse_variance(views.fit, views.fit.covariance)
-        reach = reach_of(views, variance, views.behind(posed.center))
+        reach = viewing.reach_of(views, variance, views.behind(posed.center))
         ok = reach.status == int(PositionStatus.OK)
         own = (fit.direction / views.length[..., None, :]).mT
         sight = torch.where(views.fitted[..., None], own, (views.anchor[..., None] * views.rays).sum(-2))
@@ -528,7 +511,7 @@ class Localizer(Operations, Movable, StatedModule):
             enu=torch.where(torn[..., None], 0.0, found.enu),
             covariance=torch.where(torn[..., None, None], nowhere, found.covariance),
             geodetic=torch.where(torn[..., None], self.geodetic_of_origin, found.geodetic),
-            status=flag_positions(found.status, torn, PositionStatus.CONTRADICTION),
+            status=stereo.flag_positions(found.status, torn, PositionStatus.CONTRADICTION),
         )
 
     @property
@@ -565,7 +548,7 @@ class Localizer(Operations, Movable, StatedModule):
             pixels_left: (..., N, 2).
             pixels_right: (..., N, 2).
         """
-        return _sensitivity(fit_pairs(self._two, *checked_pairs(pixels_left, pixels_right, self._two)))
+        return _sensitivity(viewing.fit_pairs(self._two, *stereo.checked_pairs(pixels_left, pixels_right, self._two)))
 
     def with_sensitivity(self, pixels_left: Tensor, pixels_right: Tensor) -> tuple[Localization, Sensitivity]:
         """`forward` and `sensitivity` for the work of one; without covariances, masks and derivatives.
@@ -575,12 +558,12 @@ class Localizer(Operations, Movable, StatedModule):
             pixels_right: (..., N, 2).
         """
         by_camera = self.calibration_factor is not None
-        pairs = checked_pairs(pixels_left, pixels_right, self._two)
-        found = fit_pairs(self.rig, *pairs, noise=self.pixel_sigma, by_camera=by_camera)
+        pairs = stereo.checked_pairs(pixels_left, pixels_right, self._two)
+        found = viewing.fit_pairs(self.rig, *pairs, noise=self.pixel_sigma, by_camera=by_camera)
         return self._by_marks(found), _sensitivity(found)
 
 
-def _sensitivity(found: ViewsFit) -> Sensitivity:
+def _sensitivity(found: viewing.ViewsFit) -> Sensitivity:
     fit, scale, usable = found.fit, found.scale, found.fitted
     known = usable & (fit.inverse > 0)
     inverse = torch.where(known, fit.inverse, 1.0)

@@ -16,16 +16,7 @@ from torch import Tensor
 from kcal.checks import as_points
 from kcal.errors import FileError, InputError
 from kcal.files import write_atomic
-from kcal.locate.tables import (
-    CHUNK_ROWS,
-    DistinctKeys,
-    Doubled,
-    TableChunk,
-    TableRow,
-    guarded,
-    header_of,
-    read_chunks,
-)
+from kcal.locate.tables import CHUNK_ROWS, DistinctKeys, Doubled, TableChunk, TableRow, guarded, header_of, read_chunks
 from kcal.texts import briefly, csv_line
 
 # The wide table has one line for each point that two cameras saw, the long one a line for each mark.

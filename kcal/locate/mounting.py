@@ -38,11 +38,7 @@ def attitude(enu_from_cam: Tensor) -> tuple[float, float, float]:
 
 
 def mounting_of(
-    cam_from_enu: Tensor,
-    center: Tensor,
-    covariance: Tensor,
-    origin: Origin,
-    refraction: float = REFRACTION,
+    cam_from_enu: Tensor, center: Tensor, covariance: Tensor, origin: Origin, refraction: float = REFRACTION
 ) -> Mounting:
     """How a camera with a pose in the frame of `origin` stands where it is.
 

@@ -598,8 +598,7 @@ def _moving_landmarks(
     options: MovingOptions,
 ) -> Landmarks:
     """One landmark for each fix: at the time nearest to it, preferably one that several cameras saw."""
-    labels, points, sigma, velocity, pixels, noise = [], [], [], [], [], []
-    of: list[int] = []
+    rows = []
     for k, track in enumerate(tracks):
         moments: dict[int, dict[int, tuple[Tensor, float]]] = {}
         for one in (one for one, name in matched if name == track.name):
@@ -619,26 +618,17 @@ def _moving_landmarks(
             if old is None or rank < (-len(moments[ticks[old]]), float(away[old])):
                 best[fix] = i
         for i in best.values():
-            labels.append(f"{track.name} {ticks[i] * _SAME:.3f}")
             marks = torch.full((count, 3), math.nan, dtype=torch.float64)
             for camera, (pixel, px) in moments[ticks[i]].items():
                 marks[camera] = torch.tensor([*pixel.tolist(), px], dtype=torch.float64)
-            points.append(fixes.points[i])
-            sigma.append(fixes.sigma[i])
-            velocity.append(fixes.velocity[i])
-            pixels.append(marks[:, :2])
-            noise.append(marks[:, 2])
-            of.append(k)
-    if not labels:
+            label, *seen = f"{track.name} {ticks[i] * _SAME:.3f}", marks[:, :2], marks[:, 2]
+            rows.append((label, k, fixes.points[i], fixes.sigma[i], fixes.velocity[i], *seen))
+    if not rows:
         raise InputError("tracks and sightings have no time in common: check clocks and time zones")
-    return Landmarks(
-        names=tuple(labels),
-        points=torch.stack(points),
-        sigma=torch.stack(sigma),
-        pixels=torch.stack(pixels),
-        pixel_sigma=torch.stack(noise),
-        effects=_shared_shifts(tracks, torch.tensor(of), torch.stack(velocity), torch.stack(pixels), names, options),
-    )
+    labels, of, *parts = zip(*rows, strict=True)
+    points, sigma, velocity, pixels, noise = map(torch.stack, parts)
+    effects = _shared_shifts(tracks, torch.tensor(of), velocity, pixels, names, options)
+    return Landmarks(names=labels, points=points, sigma=sigma, pixels=pixels, pixel_sigma=noise, effects=effects)
 
 
 def _shared_shifts(

@@ -14,14 +14,14 @@ from torch import Tensor
 
 from kcal.errors import InputError
 from kcal.lens.rig import Rig
-from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic
+from kcal.locate.geodesy import anchor, azimuth_elevation, ecef_from_enu_rotation, enu_to_geodetic
 from kcal.locate.ground import Ground
-from kcal.locate.localizer import Localization, Localizer
+from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks
 from kcal.locate.positions import Located
-from kcal.locate.stereo import PositionStatus
+from kcal.locate.stereo import Localization, PositionStatus
 from kcal.locate.tables import CHUNK_ROWS, PositionColumns
-from kcal.locate.tabulate import Geoid, Group, Viewpoint, geoid_column, number_table, viewpoint
+from kcal.locate.tabulate import Geoid, Group, Viewpoint, geoid_column, middle_row_ends, number_table
 
 # A reprojection error of this many sigma is not noise: two different points were marked, or the rig has moved.
 _MISMATCH_SIGMAS = 10.0
@@ -244,12 +244,12 @@ def camera_views(localize: Localizer) -> tuple[Viewpoint, ...]:
     geodetic = enu_to_geodetic(center, origin).tolist()
     if localize.weights == "marks":
         geodetic[0] = origin.geodetic.tolist()
-    return tuple(
-        viewpoint(name, camera, place, look, (lat, lon, height))
-        for name, camera, place, look, (lat, lon, height) in zip(
-            rig.names, rig.each, center, enu_from_cam, geodetic, strict=True
-        )
-    )
+    views = []
+    for name, camera, enu, look, place in zip(rig.names, rig.each, center, enu_from_cam, geodetic, strict=True):
+        ends = middle_row_ends(camera)
+        azimuths = None if ends is None else tuple(azimuth_elevation(ends @ look.T)[:, 0].tolist())
+        views.append(Viewpoint(name=name, enu=tuple(enu.tolist()), geodetic=tuple(place), azimuths_deg=azimuths))
+    return tuple(views)
 
 
 def _pair_reason(status: PositionStatus, found: Localization, i: int, baseline: float, exchanged: bool) -> str:

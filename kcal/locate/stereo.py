@@ -112,22 +112,24 @@ def checked_pairs(pixels_left: Tensor | ArrayLike, pixels_right: Tensor | ArrayL
     return left, right
 
 
-def checked_pair_covariance(cov: Tensor | None, left: Tensor) -> Tensor | None:
-    """(..., N, 4, 4) float64 of covariances that broadcast to pairs (..., N, 2)."""
+def checked_covariance(
+    cov: Tensor | None, lead: tuple[int, ...], each: tuple[int, ...], like: Tensor | None = None
+) -> Tensor | None:
+    """(*lead, *each) float64 of covariances that broadcast to that; `each` ends with their rows and columns."""
     if cov is None:
         return None
-    cov = as_points("cov", cov, 4, left)
-    if cov.ndim < 2 or cov.shape[-2] != 4:
-        raise InputError(f"cov: shape (..., N, 4, 4) is needed, got {tuple(cov.shape)}")
-    return expanded("cov", cov, (*left.shape[:-1], 4, 4))
+    cov = as_points("cov", cov, each[-1], like)
+    if cov.ndim < 2 or cov.shape[-2] != each[-1]:
+        raise InputError(f"cov: shape (..., N, {', '.join(map(str, each))}) is needed, got {tuple(cov.shape)}")
+    return expanded("cov", cov, (*lead, *each))
 
 
-def checked_mask(mask: Tensor, shape: tuple[int, ...], device: torch.device) -> Tensor:
+def checked_mask(mask: Tensor, shape: tuple[int, ...], device: torch.device, name: str = "mask") -> Tensor:
     """A mask of bool, broadcast to a shape."""
     mask = torch.as_tensor(mask, device=device)
     if mask.dtype != torch.bool:
-        raise InputError(f"mask: bool is needed, got {mask.dtype}")
-    return expanded("mask", mask, shape)
+        raise InputError(f"{name}: bool is needed, got {mask.dtype}")
+    return expanded(name, mask, shape)
 
 
 def checked_views(pixels: Tensor | ArrayLike, seen: Tensor | None, count: int, like: Tensor) -> tuple[Tensor, Tensor]:
@@ -137,20 +139,7 @@ def checked_views(pixels: Tensor | ArrayLike, seen: Tensor | None, count: int, l
         raise InputError(f"pixels: shape (..., {count}, 2) is needed, got {tuple(pixels.shape)}")
     if seen is None:
         return pixels, torch.ones(pixels.shape[:-1], dtype=torch.bool, device=pixels.device)
-    seen = torch.as_tensor(seen, device=pixels.device)
-    if seen.dtype != torch.bool:
-        raise InputError(f"seen: bool is needed, got {seen.dtype}")
-    return pixels, expanded("seen", seen, pixels.shape[:-1])
-
-
-def checked_views_covariance(cov: Tensor | None, pixels: Tensor) -> Tensor | None:
-    """(..., V, 2, 2) float64 of covariances that broadcast to those of pixels (..., V, 2)."""
-    if cov is None:
-        return None
-    cov = as_points("cov", cov, 2)
-    if cov.ndim < 2 or cov.shape[-2] != 2:
-        raise InputError(f"cov: shape (..., N, {pixels.shape[-2]}, 2, 2) is needed, got {tuple(cov.shape)}")
-    return expanded("cov", cov, (*pixels.shape, 2))
+    return pixels, checked_mask(seen, pixels.shape[:-1], pixels.device, "seen")
 
 
 def joint_covariance(cov: Tensor) -> Tensor:

@@ -156,9 +156,8 @@ def _refuse_exchanged(rows: Sequence[TableRow], values: Tensor) -> None:
 
 
 def _coordinates(row: TableRow, path: str | Path) -> tuple[str, str, str]:
-    for columns in (EARTH, LOCAL):
+    for columns, other in ((EARTH, LOCAL), (LOCAL, EARTH)):
         if all(column in row.cells for column in columns):
-            other = LOCAL if columns == EARTH else EARTH
             if any(column in row.cells for column in other):
                 raise FileError(f"{path}: lat, lon, height or east, north, up are needed, not both")
             return columns

@@ -65,25 +65,19 @@ class PositionColumns(NamedTuple):
         """(N,) one of the numbers."""
         return self.numbers[:, NUMBERS.index(name)]
 
-    def rows(self, which: NDArray[np.intp]) -> PositionColumns:
+    def rows(self, which: NDArray[np.intp] | slice) -> PositionColumns:
         """Some of the pairs."""
-        places = which.tolist()
-        return PositionColumns(
-            [self.names[i] for i in places],
-            self.status[which],
-            [self.reasons[i] for i in places],
-            self.numbers[which],
-            {name: [cells[i] for i in places] for name, cells in self.extras.items()},
-            self.anchor[which],
-        )
+
+        def some(cells: Any) -> Any:
+            return cells[which] if isinstance(which, slice) else [cells[i] for i in which.tolist()]
+
+        extras = {name: some(cells) for name, cells in self.extras.items()}
+        names, reasons = some(self.names), some(self.reasons)
+        return PositionColumns(names, self.status[which], reasons, self.numbers[which], extras, self.anchor[which])
 
     def pieces(self, size: int) -> Iterator[PositionColumns]:
         """The same rows in turn, `size` at a time."""
-        for start in range(0, len(self.names), size):
-            part = slice(start, start + size)
-            extras = {name: cells[part] for name, cells in self.extras.items()}
-            names, reasons = self.names[part], self.reasons[part]
-            yield PositionColumns(names, self.status[part], reasons, self.numbers[part], extras, self.anchor[part])
+        return (self.rows(slice(start, start + size)) for start in range(0, len(self.names), size))
 
     @classmethod
     def joined(cls, parts: Sequence[PositionColumns]) -> PositionColumns:

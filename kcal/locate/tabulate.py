@@ -395,20 +395,6 @@ def number_table(found: Localization, more: Sequence[Group] = (), *, on_earth: b
     return np.ascontiguousarray(table.T)
 
 
-def viewpoint(
-    name: str, camera: Camera, enu: Tensor, enu_from_camera: Tensor, geodetic: tuple[float, float, float]
-) -> Viewpoint:
-    """Where a camera stands and what it sees, given its center (3,), attitude (3, 3) and place on the Earth."""
-    ends = middle_row_ends(camera)
-    east, north, up = enu.tolist()
-    return Viewpoint(
-        name=name,
-        enu=(east, north, up),
-        geodetic=geodetic,
-        azimuths_deg=None if ends is None else tuple(azimuth_elevation(ends @ enu_from_camera.T)[:, 0].tolist()),
-    )
-
-
 def middle_row_ends(camera: Camera) -> Tensor | None:
     """Rays (2, 3) through the left and right ends of the image's middle row, on the CPU; None where there are none."""
     width, height = camera.size

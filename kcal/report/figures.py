@@ -74,9 +74,12 @@ def _make_plain(parts: Artist) -> None:
             part.set_parse_math(False)
             part.set_text(_shown(part.get_text()))
         # Names at ticks are written anew at each drawing, by a function.
-        elif isinstance(part, Axis) and isinstance(names := part.get_major_formatter(), FuncFormatter):
-            if getattr(names.func, "func", None) is not _shown_tick:
-                part.set_major_formatter(partial(_shown_tick, names.func))
+        elif (
+            isinstance(part, Axis)
+            and isinstance(names := part.get_major_formatter(), FuncFormatter)
+            and getattr(names.func, "func", None) is not _shown_tick
+        ):
+            part.set_major_formatter(partial(_shown_tick, names.func))
 
 
 def _shown_tick(names: Callable[[float, int | None], str], at: float, place: int | None) -> str:

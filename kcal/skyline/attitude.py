@@ -485,7 +485,7 @@ def _joined(
         part[:, 3 * (count + c) : 3 * (count + c) + 3] = seen.by_shift @ turn.T
         part[:, begin[c] : begin[c + 1]] = seen.by_lens
         # At the attitude of the camera's first image.
-        off = _vector((rotation[c] @ here.T).numpy())
+        off = vector_from_rotation(rotation[c] @ here.T).numpy()
         rows.append(part)
         residual.append(seen.residual + seen.by_turn @ off)
         widened += len(part) * [one.widened]
@@ -522,8 +522,3 @@ def _world_from_eye(origin: Origin, eye: Origin) -> Floats:
     """(3, 3) from east, north, up of an eye to those of the rig's origin."""
     world, own = (ecef_from_enu_rotation(place.lat, place.lon).numpy() for place in (origin, eye))
     return world.T @ own
-
-
-def _vector(rotation: Floats) -> Floats:
-    """Rotation vector of a small rotation."""
-    return vector_from_rotation(torch.from_numpy(np.ascontiguousarray(rotation))).numpy()

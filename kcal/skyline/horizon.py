@@ -127,8 +127,7 @@ def _strength(step: Floats, noise: Floats, least: float) -> Floats:
     spread = noise * math.sqrt(2.0 / (_BOX * _ACROSS))
     scale = np.maximum(_SURE * spread, least)
     found: Floats = np.square(step) / (np.square(step) + np.square(scale))
-    found[: 2 * _BOX] = 0.0
-    found[-2 * _BOX :] = 0.0
+    found[: 2 * _BOX] = found[-2 * _BOX :] = 0.0
     return found
 
 
@@ -396,10 +395,8 @@ def terrain_horizon(raster: Raster, eye: Origin, azimuth: Floats, *, refraction:
         )
     rays = TerrainRays(raster, eye, refraction)
     distance = sample_distances(raster, rays)
-    parts = []
     each = max(_SAMPLES // len(distance), 1)
-    for begin in range(0, len(azimuth), each):
-        parts.append(_highest(rays, azimuth[begin : begin + each], distance))
+    parts = [_highest(rays, azimuth[i : i + each], distance) for i in range(0, len(azimuth), each)]
     elevation, far, point, known, reach = (np.concatenate(part) for part in zip(*parts, strict=True))
     highest = float(np.nanmax(raster.heights))
     curve = (1.0 - refraction) / (2.0 * rays.radius)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import itertools
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -216,14 +217,11 @@ def read_night(path: str | Path) -> NDArray[Any]:
         return _read_fits(Path(path))
     if suffix not in VIDEO_SUFFIXES:
         return read_gray(path)
-    total, count = None, 0
-    for frame in read_frames(path):
-        gray = np.asarray(frame.image, np.float64)
-        total = gray if total is None else total + gray
-        count += 1
-        if count == _MOST_FRAMES:
-            break
-    if total is None:
+    total: Any = 0.0
+    count = 0
+    for frame in itertools.islice(read_frames(path), _MOST_FRAMES):
+        total, count = total + np.asarray(frame.image, np.float64), count + 1
+    if not count:
         raise FileError(f"{path}: the video has no frames")
     return total / count
 

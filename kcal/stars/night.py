@@ -158,13 +158,7 @@ def refraction_doubt(seen: Attitude, sigma: Floats, refracted: Tensor, straight:
 
 
 def _names_at(
-    pixels: Floats,
-    reach: Floats,
-    directions: Tensor,
-    magnitude: Floats,
-    camera: Camera,
-    rotation: Tensor,
-    least: float,
+    pixels: Floats, reach: Floats, directions: Tensor, magnitude: Floats, camera: Camera, rotation: Tensor, least: float
 ) -> NDArray[np.int64]:
     """(N,) the star of the catalog at each pixel; -1 for none, or where another star pulls it.
 

@@ -313,8 +313,6 @@ def _quiet(erfa: Any) -> warnings.catch_warnings[None]:
     return warnings.catch_warnings(action="ignore", category=erfa.ErfaWarning)
 
 
-# Name stars without knowing where the camera looks, from the angles between the brightest of them.
-
 # Angles between bright stars, sorted, for identification; kept on disk in the user's folder for caches.
 
 # Degrees. A table is made for the first that is enough for a field.
