@@ -240,10 +240,7 @@ def test_corners_that_are_not_seen_say_nothing(
     seen[0, 10:] &= hidden != "uneven"
     weights = torch.ones(4, BOARD.corners, dtype=F64)
     readout = Readout(
-        center=BOARD.points.mean(0),
-        distance=0.6,
-        size=SIZE,
-        bends=board_modes(BOARD.points).heights if bends else None,
+        center=BOARD.points.mean(0), distance=0.6, size=SIZE, bends=board_modes(BOARD.points).heights if bends else None
     )
     problem = BoardProblem(
         BOARD.points, torch.where(seen[..., None], whole.pixels, torch.nan), whole.model, whole.free,
@@ -493,12 +490,7 @@ def test_motion_is_looked_for_beside_a_fit_of_views_that_stand_still(rate: float
     pixels, points = capture(rate, 8), BOARD.points
     weights, board = torch.ones_like(pixels[..., 0]), board_modes(BOARD.points)
     views = FittedViews(
-        points=points,
-        board=board,
-        pixels=pixels,
-        size=SIZE,
-        weights=weights,
-        hyperprior=typical_hyperprior(MODES),
+        points=points, board=board, pixels=pixels, size=SIZE, weights=weights, hyperprior=typical_hyperprior(MODES)
     )
     estimate, _ = fit_base(views, MODES)
     rounds = run_rounds(views, estimate, cold=True, rough=True)

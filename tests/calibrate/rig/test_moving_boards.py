@@ -128,10 +128,7 @@ def test_what_is_told_of_motions_is_that_of_all_rows(shared: int) -> None:
     off = without_local(rows, 6)
     counts = float(views * (2 * corners - 6))
     whole = view_data(
-        Products.of_rows(off, 12),
-        torch.zeros(shared, dtype=F64),
-        torch.zeros(views, 12, dtype=F64),
-        counts,
+        Products.of_rows(off, 12), torch.zeros(shared, dtype=F64), torch.zeros(views, 12, dtype=F64), counts
     )
     length = off[:, 12:-1].transpose(0, 1).flatten(1).norm(dim=1)
     none = torch.full((shared,), -1)

@@ -8,19 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from rig_scenes import (
-    CAMERAS,
-    CENTER,
-    NAMES,
-    ROTATION,
-    boards,
-    features,
-    landmarks,
-    normal,
-    see,
-    spread_points,
-    tensor,
-)
+from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, boards, features, landmarks, normal, see, spread_points, tensor
 from torch import Tensor
 
 from kcal import Baseline, DegenerateError, MeasuredPosition

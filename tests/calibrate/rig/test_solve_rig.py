@@ -295,10 +295,7 @@ class TestRecovery:
 
 class TestFrame:
     @settings(max_examples=6)
-    @given(
-        turn=st.tuples(*[st.floats(-3.0, 3.0)] * 3),
-        shift=st.tuples(*[st.floats(-5e4, 5e4)] * 3),
-    )
+    @given(turn=st.tuples(*[st.floats(-3.0, 3.0)] * 3), shift=st.tuples(*[st.floats(-5e4, 5e4)] * 3))
     def test_the_solution_moves_with_the_frame(self, turn: tuple, shift: tuple) -> None:
         """Landmarks turned and shifted as a whole, up to 50 km: cameras follow, relative pose and sigmas stay."""
         marks = landmarks(noise=0.1, error=0.02)
