@@ -285,24 +285,21 @@ def test_damping_follows_the_gain_ratio() -> None:
 
 
 class TestRefusals:
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.int64])
-    def test_dtype(self, dtype: torch.dtype) -> None:
-        with pytest.raises(InputError, match=r"must be float64, got torch\.\w+; use \.double\(\)"):
-            LevenbergMarquardt(rosenbrock)(torch.ones(2, dtype=dtype))
-
-    @pytest.mark.parametrize("value", [math.nan, math.inf])
-    def test_not_finite(self, value: float) -> None:
-        with pytest.raises(InputError, match="1 of 2 values are not finite"):
-            LevenbergMarquardt(rosenbrock)(vector(value, 1.0))
-
-    @pytest.mark.parametrize("start", [torch.tensor(1.0).double(), torch.zeros(0).double(), torch.zeros(0, 2).double()])
-    def test_shape(self, start: Tensor) -> None:
-        with pytest.raises(InputError, match=r"a tensor \(\.\.\., P\) with values"):
+    @pytest.mark.parametrize(
+        ("start", "message"),
+        [
+            *(
+                (torch.ones(2, dtype=dtype), r"must be float64, got torch\.\w+; use \.double\(\)")
+                for dtype in (torch.float32, torch.float16, torch.int64)
+            ),
+            *((vector(value, 1.0), "1 of 2 values are not finite") for value in (math.nan, math.inf)),
+            *((torch.zeros(shape).double(), r"a tensor \(\.\.\., P\) with values") for shape in ((), (0,), (0, 2))),
+            ([1.0, 2.0], "got list"),
+        ],
+    )
+    def test_starts(self, start: Tensor, message: str) -> None:
+        with pytest.raises(InputError, match=message):
             LevenbergMarquardt(lambda x: x)(start)
-
-    def test_not_a_tensor(self) -> None:
-        with pytest.raises(InputError, match="got list"):
-            LevenbergMarquardt(rosenbrock)([1.0, 2.0])
 
     def test_residuals_in_single_precision(self) -> None:
         with pytest.raises(InputError, match=r"got torch\.float32"):

@@ -16,8 +16,7 @@ from kcal import Board, Camera, DegenerateError, InputError, detect
 from kcal.calibrate.camera import hybrid
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.checks import OutlierRejection, copied_views, corners_beyond, least_planar, repeated_poses
-from kcal.calibrate.problem.parameters import CoefficientPrior, is_overparameterized
-from kcal.lens import LensModel, rotation_from_vector
+from kcal.lens import rotation_from_vector
 from kcal.lens.projection import project_components
 
 # Wrong corners and views are found, listed and left out; good ones stay.
@@ -492,38 +491,10 @@ def test_tied_and_fixed_parameters_in_the_covariance() -> None:
     assert bool((found[2] == 0).all())
 
 
-class TestMild:
-    def test_shifts_at_the_outermost_corner(self) -> None:
-        """One σ of any radial term moves the outermost corner by the width; of the others by a thirtieth."""
-        model, r = LensModel.named("ext20"), 0.6
-        prior = CoefficientPrior(0.3, r).term(model, noise=0.2)
-        names = [("skew", *model.names)[i - 4] for i in prior.index.tolist()]
-        sigma = dict(zip(names, (0.2 / prior.weight).tolist(), strict=True))
-        assert set(sigma) == set(model.names)
-        assert sigma["k2"] * r**4 == pytest.approx(0.3)
-        assert sigma["k5"] * r**4 == pytest.approx(0.3)
-        assert sigma["s2"] * r**4 / r == pytest.approx(0.01)
-        assert sigma["s5"] * r**6 / r == pytest.approx(0.01)
-        assert sigma["p1"] * r == pytest.approx(0.01)
-        assert sigma["tau_x"] * r == pytest.approx(0.01)
-
-    def test_own_priors_take_its_place(self) -> None:
-        model = LensModel.named("opencv5")
-        prior = CoefficientPrior(0.3, 0.5).term(model, 0.2, without=("k1", "p2"))
-        assert [model.names[i - 5] for i in prior.index.tolist()] == ["k2", "p1", "k3"]
-
-    def test_which_models_are_rich(self) -> None:
-        rich = {
-            name
-            for name in ("pinhole", "opencv5", "opencv8", "opencv14", "fisheye4")
-            if is_overparameterized(LensModel.named(name))
-        }
-        assert rich == {"opencv8", "opencv14"}
-
-    @pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
-    def test_refused(self, value: float) -> None:
-        with pytest.raises(InputError, match="weak_prior"):
-            CalibrationOptions(weak_prior=value)
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
+def test_a_weak_prior_that_is_none_is_refused(value: float) -> None:
+    with pytest.raises(InputError, match="weak_prior"):
+        CalibrationOptions(weak_prior=value)
 
 
 def test_a_small_model_hardly_feels_the_weak_prior() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from calibrate_scenes import observe
-from printed_boards import printed_points, printed_views
+from printed_boards import printed_points, printed_views, shape_error
 from torch import Tensor
 from typer.testing import CliRunner
 
@@ -51,13 +51,6 @@ def seen_by(number: int, points: Tensor = PRINT, count: int = 5, turns: Tensor |
     return observe(pixels if turns is None else turned_corners(pixels, BOARD, turns), board=BOARD, size=SIZE)
 
 
-def shape_error(points: Tensor) -> float:
-    """RMS distance in meters of a board from the print, at the best fit of one to the other."""
-    a, b = points - points.mean(0), PRINT - PRINT.mean(0)
-    u, s, vh = torch.linalg.svd(a.T @ b)
-    return float((s.sum() / a.square().sum() * a @ u @ vh - b).square().sum(-1).mean().sqrt())
-
-
 @functools.cache
 def alone(number: int) -> CameraCalibrationResult:
     return calibrate_camera(seen_by(number), STILL)
@@ -77,8 +70,8 @@ def result_of(outcome: object) -> CameraCalibrationResult:
 def test_a_shared_board_is_better_known() -> None:
     """Five views each: errors of the board fall to less than 0.8, and σ of the camera tells."""
     found = pair()
-    shared = sum(shape_error(result.board_points) ** 2 for result in found)
-    assert shared < 0.8**2 * sum(shape_error(alone(k).board_points) ** 2 for k in (1, 2))
+    shared = sum(shape_error(result.board_points, PRINT) ** 2 for result in found)
+    assert shared < 0.8**2 * sum(shape_error(alone(k).board_points, PRINT) ** 2 for k in (1, 2))
     for number, other, result in ((1, 1, found[0]), (2, 0, found[1])):
         assert result.shared_board.others == (other,)
         assert result.shared_board.evidence > 10

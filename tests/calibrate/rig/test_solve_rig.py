@@ -20,7 +20,6 @@ from rig_scenes import (
     features,
     landmarks,
     normal,
-    see,
     spread_points,
     tensor,
 )
@@ -31,7 +30,6 @@ from kcal.calibrate.rig import initial_poses, solve
 from kcal.calibrate.rig import sources as board_limits
 from kcal.calibrate.rig.marks import Features, inverse_range_beyond
 from kcal.calibrate.rig.problem import RigProblem
-from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import Context, PosedCamera, RigState, Start, as_items
@@ -174,25 +172,6 @@ class TestDerivatives:
         rows = problem.blocks[0].rows(problem.posed(state), problem.parts(state)[0][1], problem.shared_size)
         assert bool((rows[1, :, 84 + 3] == 0).all())
         assert bool((rows[1, :, 84 + 42 + 3] == 0).all())
-
-
-class TestResection:
-    def test_three_points_give_the_pose_among_four(self) -> None:
-        points = spread_points(3, 100.0, 900.0, 1)
-        rays = (points - CENTER[0]) @ ROTATION[0].T
-        rotation, center = poses_from_three(rays / rays.norm(dim=-1, keepdim=True), points)
-        error = (center - CENTER[0]).norm(dim=-1).nan_to_num(math.inf)
-        best = int(error.argmin())
-        assert float(error[best]) < 1e-7
-        torch.testing.assert_close(rotation[best], ROTATION[0], rtol=0, atol=1e-9)
-
-    def test_a_minority_of_wrong_points_does_no_harm(self) -> None:
-        points = spread_points(9, 60.0, 900.0, 2)
-        rays = (points - CENTER[0]) @ ROTATION[0].T
-        rays = rays / rays.norm(dim=-1, keepdim=True)
-        points[[1, 4, 6]] += tensor([30.0, 0, 9], [0, -50, 20], [9, 9, -40])
-        found = consensus_pose(rays, points)
-        assert float((found[1] - CENTER[0]).norm()) < 1e-6
 
 
 SOURCES = {
@@ -361,9 +340,7 @@ class TestIntrinsics:
             type(camera)(values, size=camera.size, model=camera.model)
             for camera, values in zip(CAMERAS, rough, strict=False)
         )
-        sources = data(
-            landmarks=landmarks(count=30, noise=0.1, error=0.02), boards=boards(noise=0.1)
-        )  # fmt: skip
+        sources = data(landmarks=landmarks(count=30, noise=0.1, error=0.02), boards=boards(noise=0.1))
         for camera in cameras:
             camera.calibration = CameraCalibration(covariance=torch.diag(spread**2))
         sources = dataclasses.replace(sources, cameras=cameras)
@@ -641,7 +618,3 @@ def _without(pixels: Tensor, index: int) -> Tensor:
     pixels = pixels.clone()
     pixels[index] = torch.nan
     return pixels
-
-
-def test_see_marks_what_is_outside() -> None:
-    assert bool(torch.isnan(see(CENTER[0][None] - 10.0 * ROTATION[0][2], 0)).all())
