@@ -186,12 +186,10 @@ def test_without_pyerfa(monkeypatch: pytest.MonkeyPatch, night: Any) -> None:
         name_stars(night, CAMERA, SkyView(time=TIME, origin=PLACE))
 
 
-def test_wrong_camera() -> None:
-    pixels, index = star_pixels(CAMERA, LOOK)
-    image = rendered(CAMERA, pixels, CATALOG.magnitude[index])
+def test_wrong_camera(night: Any) -> None:
     other = Camera.build(focal=(1500, 1500), center=(479.5, 299.5), size=(960, 600), model="pinhole")
     with pytest.raises(InputError, match="the camera file is of another lens"):
-        name_stars(image, other)
+        name_stars(night, other)
 
 
 @pytest.mark.parametrize(

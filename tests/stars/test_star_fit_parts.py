@@ -142,12 +142,15 @@ class TestTurns:
 
 
 class TestRefraction:
+    def directions(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Straight and refracted: straight up they are not bent; lower stars are lifted."""
+        straight, _ = scattered(40)
+        lifted = straight + 2e-3 * torch.stack([0 * straight[:, 0], 0 * straight[:, 0], 1 - straight[:, 2] ** 2], -1)
+        return straight, torch.nn.functional.normalize(lifted, dim=-1)
+
     def doubt(self, share: float, sigma: float = 0.1) -> str | None:
         """Stars that are refracted by a share of what they should be."""
-        straight, _ = scattered(40)
-        # Straight up they are not bent; lower stars are lifted.
-        lifted = straight + 2e-3 * torch.stack([0 * straight[:, 0], 0 * straight[:, 0], 1 - straight[:, 2] ** 2], -1)
-        refracted = torch.nn.functional.normalize(lifted, dim=-1)
+        straight, refracted = self.directions()
         true = torch.nn.functional.normalize(straight + share * (refracted - straight), dim=-1)
         at, seen = (seen_turned(CAMERA, FAR * one, TURN)[0].T.numpy() for one in (refracted, true))
         star = np.arange(40)
@@ -168,9 +171,7 @@ class TestRefraction:
 
     def test_what_a_good_lens_errs_is_no_doubt(self) -> None:
         """However sure: only where the pattern that no turn explains differs by more than .04 px, root mean square."""
-        straight, _ = scattered(40)
-        lifted = straight + 2e-3 * torch.stack([0 * straight[:, 0], 0 * straight[:, 0], 1 - straight[:, 2] ** 2], -1)
-        refracted = torch.nn.functional.normalize(lifted, dim=-1)
+        straight, refracted = self.directions()
         used = torch.arange(40) != 3
         (at, rows), (without, _) = (seen_turned(CAMERA, FAR * one[used], TURN) for one in (refracted, straight))
         pattern, turns = (at - without).flatten().numpy(), rows[:3].flatten(1).T.numpy()

@@ -131,8 +131,7 @@ def test_the_spread_of_tilts_counts_not_the_tilt(spread: float, refused: bool) -
     place = (2.0 * torch.rand(count, 3, generator=draw).double() - 1.0) * torch.tensor([0.05, 0.04, 0.04])
     pixels = truth.project(points + (place + torch.tensor([0.0, 0.0, 0.65]))[:, None])[0]
     pixels = pixels + 0.02 * torch.randn(pixels.shape, generator=draw, dtype=torch.float64)
-    views = tuple(View(name=str(i), pixels=tuple(map(tuple, one))) for i, one in enumerate(pixels.tolist()))
-    seen = Observations(board=board, image_size=(640, 480), views=views)
+    seen = observe(pixels, board=board)
     if refused:
         with pytest.raises(DegenerateError, match="tilted alike"):
             calibrate_camera(seen)

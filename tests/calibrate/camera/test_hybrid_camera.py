@@ -150,12 +150,6 @@ def test_views_parallel_to_the_image_do_not_determine_the_focal_length() -> None
         calibrate_camera(observe(pixels_of(truth(), (poses, shifts), noise=NOISE)))
 
 
-def test_too_few_views() -> None:
-    pixels = pixels_of(truth(), motions(truth(), 2, 3), noise=NOISE)
-    with pytest.raises(DegenerateError, match="at least 3"):
-        calibrate_camera(observe(pixels))
-
-
 @pytest.mark.parametrize(
     "given",
     [

@@ -129,7 +129,9 @@ class TestTruth:
     @pytest.mark.slow
     def test_sigma_is_the_spread(self) -> None:
         """40 repetitions: 39 s² / σ² is χ²; s² / σ² lies in 0.332 to 2.17 but for 6e-5 (4 standard deviations)."""
-        results = [solve(views(4, 5, noise=0.2, noise_seed=seed)) for seed in range(40)]
+        # In which nothing moves and nothing is wrong.
+        plain = {"motion": False, "reject": False}
+        results = [solve(views(4, 5, noise=0.2, noise_seed=seed), **plain) for seed in range(40)]
         turns = torch.stack(
             [vector_from_rotation(result.stereo().right_from_left_rotation @ ROTATION.T) for result in results]
         )
@@ -242,9 +244,9 @@ class TestWeights:
 class TestTurned:
     """Trap 8: a board read from its other end in some pairs."""
 
-    @pytest.mark.parametrize("board", [BOARD, AMBIGUOUS], ids=["7x6", "8x6"])
-    @pytest.mark.parametrize("side", [0, 1])
-    @pytest.mark.parametrize("count", [1, 2])
+    @pytest.mark.parametrize(
+        ("count", "side", "board"), [(1, 0, BOARD), (2, 1, BOARD), (1, 1, AMBIGUOUS), (2, 0, AMBIGUOUS)]
+    )
     def test_in_20_and_40_percent_of_pairs(self, count: int, side: int, board: Board) -> None:
         pixels = views(5, 7, board=board, noise=0.1)
         plain = solve(pixels, board=board)
@@ -306,7 +308,7 @@ class TestWrongPairs:
         assert any(text.startswith("board l3 r3: ") and text.endswith("it was kept") for text in result.warnings)
         assert any("px is high" in text for text in result.warnings)
 
-    @pytest.mark.parametrize("shift", [(0.0, 4.0), (4.0, 0.0), (0.0, 8.0), (15.0, 0.0)])
+    @pytest.mark.parametrize("shift", [(0.0, 4.0), (15.0, 0.0)])
     def test_a_board_that_moved_between_the_exposures(self, shift: tuple[float, float]) -> None:
         """Left in, 4 px in one pair of eight turn the rig by 0.4 degrees."""
         pixels = views(8, 2, noise=0.1)
