@@ -14,7 +14,7 @@ import torch
 from kcal import Camera, FileError, InputError, Origin
 from kcal.locate import enu_from_cam
 from kcal.stars.detect import detect_stars, read_night
-from kcal.stars.night import SkyView, clock_doubts, field_angle, name_stars
+from kcal.stars.night import SkyView, field_angle, name_stars
 from kcal.stars.sky import StarCatalog, _table_of, cache_folder, identify, observed_directions, pair_table
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
 
@@ -208,23 +208,6 @@ def test_refraction_tells_a_wrong_time_or_place(night: Any, hours: float, degree
         (text,) = found.warnings
         assert text.startswith("refraction is ")
         assert float(text.split()[2]) == pytest.approx(share, abs=0.1)
-
-
-def test_a_fixed_camera_tells_a_wrong_time(night: Any) -> None:
-    later = TIME + datetime.timedelta(hours=2)
-    pixels, index = star_pixels(CAMERA, LOOK, time=later)
-    second = rendered(CAMERA, pixels, CATALOG.magnitude[index], seed=1)
-    first = name_stars(night, CAMERA, SkyView(time=TIME, origin=PLACE))
-    right = name_stars(second, CAMERA, SkyView(time=later, origin=PLACE))
-    summer = name_stars(second, CAMERA, SkyView(time=later + datetime.timedelta(hours=1), origin=PLACE))
-    assert clock_doubts([first, right]) == []
-    ((number, text),) = clock_doubts([first, summer])
-    assert number == 1
-    assert "(1.00 h)" in text
-    # A camera that was turned is no doubt.
-    pixels, index = star_pixels(CAMERA, (140.0, 35.0, 2.0), time=later)
-    moved = name_stars(rendered(CAMERA, pixels, CATALOG.magnitude[index]), CAMERA, SkyView(time=later, origin=PLACE))
-    assert clock_doubts([first, moved]) == []
 
 
 def test_fits(night: Any, tmp_path: Path) -> None:

@@ -173,12 +173,6 @@ def test_its_uncertainty(found: StarCamera) -> None:
     assert 5 < found.lens.effective < 40
 
 
-def test_points_that_are_no_stars_get_no_names(found: StarCamera) -> None:
-    images, _ = star_images(35.0, 2, seed=1)
-    for image, star in zip(images, found.stars, strict=True):
-        assert 0.7 * (len(image.pixels) - 5) < len(star) <= len(image.pixels) - 5
-
-
 def test_all_pairs_of_bright_stars_are_in_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KCAL_CACHE", str(tmp_path))
     catalog = StarCatalog.bundled()
@@ -230,7 +224,9 @@ def test_a_lens_from_stars() -> None:
     images, views = star_images(35.0, 6, seed=1)
     found = calibrate_by_stars(images, views, SIZE)
     assert found.images == tuple(range(6))
-    assert all(len(star) > 0.7 * (len(image.pixels) - 5) for star, image in zip(found.stars, images, strict=True))
+    # Of each image five points are no stars.
+    for star, image in zip(found.stars, images, strict=True):
+        assert 0.7 * (len(image.pixels) - 5) < len(star) <= len(image.pixels) - 5
     assert found.lens.rms_px == pytest.approx(0.1, rel=0.15)
     error = lens_difference(found)
     assert np.sqrt((error**2).mean()) < 0.06

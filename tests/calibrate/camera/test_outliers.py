@@ -75,17 +75,15 @@ def test_clean_data_keep_all_corners_and_the_same_result() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("model", "views", "seed"), [("opencv5", 14, 4), ("opencv8", 25, 4)])
-def test_gross_outliers_are_found_and_move_nothing(model: str, views: int, seed: int) -> None:
-    """By more than a σ. 14 views do not determine the eight coefficients (flat valley), so that one has more views."""
-    clean = scene(views)
-    pixels, wrong = spoil(clean, seed)
-    assert len(wrong) >= 5
-    options = CalibrationOptions(weak_prior=None, model=model, reject=OutlierRejection())
+def test_gross_outliers_are_found_and_move_nothing() -> None:
+    """By more than a σ; of 25 views, as 14 do not determine eight coefficients (flat valley)."""
+    clean = scene(25)
+    pixels, wrong = spoil(clean, 4)
+    options = CalibrationOptions(weak_prior=None, model="opencv8", reject=OutlierRejection())
     result = calibrate_camera(observe(pixels), options)
-    reference = calibrate_camera(observe(clean), CalibrationOptions(weak_prior=None, model=model))
+    reference = calibrate_camera(observe(clean), CalibrationOptions(weak_prior=None, model="opencv8"))
     assert listed(result) == wrong
-    assert result.rejected_share == pytest.approx(len(wrong) / (views * 42))
+    assert result.rejected_share == pytest.approx(len(wrong) / (25 * 42))
     before, after = (dict(zip(r.camera.names, r.camera.params.tolist(), strict=True)) for r in (reference, result))
     for name, sigma in reference.sigma.items():
         assert sigma is not None
@@ -100,6 +98,8 @@ def test_gross_outliers_are_found_and_move_nothing(model: str, views: int, seed:
 def test_the_result_is_that_of_the_data_that_are_left() -> None:
     pixels, wrong = spoil(scene(), 4)
     result = calibrate_camera(observe(pixels), REJECT)
+    assert len(listed(result)) >= 5
+    assert listed(result) == wrong
     for i, n in wrong:
         pixels[i, n] = torch.nan
     again = calibrate_camera(observe(pixels), CalibrationOptions(model="opencv5"))

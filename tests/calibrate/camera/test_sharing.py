@@ -211,7 +211,7 @@ def test_cameras_that_saw_other_boards_are_not_fitted_together(monkeypatch: pyte
         raise AssertionError("fitted together")
 
     monkeypatch.setattr("kcal.calibrate.camera.calibrate.fit_cameras", never)
-    found = [calibrate_camera(seen_by(number)) for number in (1, 2)]
+    found = [alone(1), alone(2)]
     other = Board(columns=BOARD.columns, rows=BOARD.rows, square=0.031)
     found[1] = dataclasses.replace(found[1], observations=found[1].observations.model_copy(update={"board": other}))
     assert sharing(found, CalibrationOptions()) == found
@@ -225,11 +225,9 @@ def test_cameras_that_cannot_be_fitted_together_stay_as_they_are_alone(monkeypat
         raise DegenerateError("nothing fits")
 
     monkeypatch.setattr("kcal.calibrate.camera.calibrate.fit_cameras", fails)
-    found = calibrate_cameras([seen_by(1), seen_by(2)])
-    alone = calibrate_camera(seen_by(1))
-    assert isinstance(found[0], CameraCalibrationResult)
-    assert torch.equal(found[0].camera.params, alone.camera.params)
-    assert found[0].warnings[-1].endswith("what other cameras tell of the board: nothing fits")
+    found = result_of(calibrate_cameras([seen_by(1), seen_by(2)], STILL)[0])
+    assert torch.equal(found.camera.params, alone(1).camera.params)
+    assert found.warnings[-1].endswith("what other cameras tell of the board: nothing fits")
 
 
 @pytest.mark.slow

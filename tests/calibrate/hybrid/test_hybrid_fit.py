@@ -45,7 +45,7 @@ def truth() -> Camera:
 
 
 def views(count: int, seed: int, points: Tensor = BOARD.points, pupil: float = 0.0) -> Tensor:
-    return printed_views(BOARD, points, count, seed, noise=NOISE, pupil=pupil)
+    return printed_views(truth(), BOARD, points, count, seed, noise=NOISE, pupil=pupil)
 
 
 @functools.cache

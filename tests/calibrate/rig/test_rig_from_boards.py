@@ -74,7 +74,7 @@ def off(result: RigResult) -> tuple[float, float]:
 
 
 class TestTruth:
-    @pytest.mark.parametrize("count", [1, 2, 5])
+    @pytest.mark.parametrize("count", [1, 2, 3])
     def test_comes_back(self, count: int) -> None:
         result = solve(views(count, 1))
         assert result.status == SolverStatus.EXACT
@@ -84,13 +84,8 @@ class TestTruth:
         assert result.flipped == ()
         assert result.left_out == ()
         assert float(result.stereo().baseline) == pytest.approx(float(TRANSLATION.norm()), rel=1e-10)
-
-    def test_few_pairs_are_warned_of(self) -> None:
-        assert solve(views(3, 1)).warnings == ()
-        for count in (1, 2):
-            assert [text.split(":")[0] for text in solve(views(count, 1)).warnings] == [
-                f"{counted_text(count, 'pair')} only"
-            ]
+        told = [text.split(":")[0] for text in result.warnings]
+        assert told == ([f"{counted_text(count, 'pair')} only"] if count < 3 else [])
 
     def test_corners_that_one_camera_did_not_see(self) -> None:
         pixels = views(5, 1)

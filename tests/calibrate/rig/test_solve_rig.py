@@ -250,15 +250,6 @@ class TestRecovery:
         assert found.variance == 1.0
         assert found.warnings == ()
 
-    def test_boards_read_from_the_other_end(self) -> None:
-        shown = boards(noise=0.05)
-        plain = solve_rig(data(boards=shown))
-        shown.pixels[2, 1] = shown.pixels[2, 1].flip(-2)
-        turned = solve_rig(data(boards=shown))
-        assert turned.flipped == (("pair 2", "right"),)
-        sigma = plain.relative_covariance().diagonal().sqrt()
-        assert bool(((pose_error(turned) - pose_error(plain)).abs() < 1e-4 * sigma).all())
-
     def test_a_baseline_sets_the_scale_of_far_features(self) -> None:
         found = solve_rig(data(features=features(count=40, noise=0.1, known=0.1), baselines=BASELINE))
         error, sigma = pose_error(found), found.relative_covariance().diagonal().sqrt()
@@ -423,13 +414,6 @@ class TestCovariance:
         assert 100 - 4 * (2 * 100) ** 0.5 < total[0] < 120 + 4 * (2 * 120) ** 0.5
         assert 120 - 4 * (2 * 120) ** 0.5 < total[1] < 120 + 4 * (2 * 120) ** 0.5
 
-    def test_joint_covariance_has_the_order_of_the_rig(self) -> None:
-        found = solve_rig(data(landmarks=landmarks(noise=0.1)), RigOptions(intrinsics="fixed"))
-        joint = found.joint_covariance()
-        assert joint.shape == (26, 26)
-        assert bool((joint[:20] == 0).all())
-        torch.testing.assert_close(joint[20:, 20:], found.relative_covariance())
-
     def test_sigmas_that_are_too_small_widen_the_covariance(self) -> None:
         marks = landmarks(count=16, noise=0.1, error=0.02)
         honest = solve_rig(data(landmarks=marks))
@@ -443,9 +427,12 @@ class TestCovariance:
 class TestWrong:
     def test_a_wrong_landmark_is_named_and_left_out(self) -> None:
         marks = landmarks(noise=0.1, error=0.02)
-        good = solve_rig(data(landmarks=dataclasses.replace(marks, pixels=_without(marks.pixels, 4))))
+        fewer = dataclasses.replace(marks, pixels=_without(marks.pixels, 4))
+        good = solve_rig(data(landmarks=fewer, baselines=BASELINE))
         marks.points[4] += tensor(0.0, 0.0, 2.0)
-        found = solve_rig(data(landmarks=marks))
+        found = solve_rig(data(landmarks=marks, baselines=BASELINE))
+        # The baseline is not blamed for it.
+        assert found.contradictions == ()
         (wrong,) = found.left_out
         assert (wrong.source, wrong.name) == ("landmarks", "post 4")
         assert "off the surveyed place by" in wrong.reason
@@ -483,18 +470,6 @@ class TestWrong:
             rest = data(landmarks=dataclasses.replace(marks, pixels=_without(marks.pixels, i)), baselines=BASELINE)
             without = solve_rig(rest, RigOptions(reject=False))
             assert float(falls[i]) == pytest.approx(whole.chi2 - without.chi2, rel=2e-2)
-
-    def test_good_ones_stay(self) -> None:
-        for seed in range(3):
-            kind = {"landmarks": landmarks(noise=0.1, error=0.02, seed=seed), "boards": boards(noise=0.1, seed=seed)}
-            assert solve_rig(data(**kind)).left_out == ()
-
-    def test_a_moment_that_was_none(self) -> None:
-        """The board moved between the exposures: one pixel in one camera."""
-        shown = boards(count=8, noise=0.05)
-        shown.pixels[5, 1] += tensor(1.0, 0.0)
-        found = solve_rig(data(boards=shown))
-        assert [item.name for item in found.left_out] == ["pair 5"]
 
     def test_lenses_that_are_not_quite_their_models_make_no_board_wrong(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """They bend some boards more than others, by much more than corners that are this good would ever be off."""
