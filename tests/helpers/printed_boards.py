@@ -11,6 +11,11 @@ from kcal import Board, Camera
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.lens import rotation_from_vector
 
+# 90 degrees across the diagonal of 1280x960 px, none of ours: opencv5.
+WIDE = Camera.build(
+    focal=(800, 800), center=(645, 476), size=(1280, 960), coefficients=[-0.12, 0.03, 4e-4, -3e-4, 0.0], model="opencv5"
+)
+
 
 def printed_points(board: Board, seed: int, share: float = 5e-4) -> Tensor:
     """(N, 3) corners of a board whose modes are drawn with `share` of their units."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
-from solve_problems import rosenbrock
+from solve_problems import Scripted, rosenbrock
 from torch import Tensor
 
 from kcal.errors import InputError
@@ -369,33 +368,6 @@ def test_trial_states_may_be_linearized() -> None:
     assert int(one.iterations) == int(usual.iterations[1])
 
 
-class ScriptedBatch:
-    """Elements whose costs and promised decreases are given, trial by trial: (E, T) each."""
-
-    joint, residual_count = False, 1
-
-    def __init__(self, costs: Tensor, promised: Tensor) -> None:
-        self.costs, self.promised, self.trial = costs, promised, 0
-
-    def linearize(self, state: tuple[Tensor]) -> SimpleNamespace:
-        return SimpleNamespace(cost=torch.ones(len(self.costs)).double(), step=self.step)
-
-    def step(self, damping: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.zeros(len(self.costs)).double(), self.promised[:, self.trial]
-
-    def retract(self, state: tuple[Tensor], step: Tensor) -> tuple[Tensor]:
-        return state
-
-    def cost(self, state: tuple[Tensor]) -> Tensor:
-        self.trial += 1
-        return self.costs[:, self.trial - 1]
-
-    def select(self, elements: Tensor) -> ScriptedBatch:
-        smaller = ScriptedBatch(self.costs[elements], self.promised[elements])
-        smaller.trial = self.trial
-        return smaller
-
-
 @pytest.mark.parametrize(("promised", "steps"), [(5e-6, 20), (1e-9, 100)])
 def test_little_gain_is_counted_from_each_elements_own_costs(promised: float, steps: int) -> None:
     """Three of four converge at once and are dropped; the last, which is not the first, gains little all the time."""
@@ -403,7 +375,7 @@ def test_little_gain_is_counted_from_each_elements_own_costs(promised: float, st
     costs = torch.stack([0.5 - 0 * trials, 0.5 - 0 * trials, 1.0 - 1e-9 * trials, 0.5 - 0 * trials])
     decreases = torch.stack([0 * trials, 0 * trials, promised + 0 * trials, 0 * trials])
     options = LMOptions(flatness=1e-6, residual_floor=0.0)
-    found = minimize(ScriptedBatch(costs, decreases), (torch.zeros(4, 1).double(),), options)  # type: ignore[arg-type,type-var]
+    found = minimize(Scripted(costs, decreases), (torch.zeros(4, 1).double(),), options)  # type: ignore[arg-type,type-var]
     assert found.status.tolist() == [SolverStatus.CONVERGED] * 2 + [SolverStatus.FLAT, SolverStatus.CONVERGED]
     assert found.iterations.tolist() == [1, 1, steps, 1]
     assert found.cost.tolist() == [0.5, 0.5, pytest.approx(1.0 - 1e-9 * steps, rel=1e-15), 0.5]
@@ -416,7 +388,7 @@ def test_only_the_last_steps_count(promised: float, steps: int) -> None:
     costs = torch.cat([0.5 ** torch.arange(1.0, 31.0), torch.full((200,), 0.5**30)]).double()
     costs = costs * (1.0 - 1e-9 * torch.arange(len(costs), dtype=torch.float64))
     options = LMOptions(flatness=1e-6, residual_floor=0.0)
-    problem = ScriptedBatch(costs[None], promised * costs[None])
+    problem = Scripted(costs[None], promised * costs[None])
     found = minimize(problem, (torch.zeros(1, 1).double(),), options)  # type: ignore[arg-type,type-var]
     assert found.status.tolist() == [SolverStatus.FLAT]
     assert found.iterations.tolist() == [30 + steps]

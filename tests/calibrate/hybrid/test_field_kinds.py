@@ -6,10 +6,10 @@ import math
 
 import pytest
 import torch
-from printed_boards import middle_error, printed_views
+from printed_boards import WIDE, middle_error, printed_views
 from torch import Tensor
 
-from kcal import Board, Camera
+from kcal import Board
 from kcal.calibrate.hybrid import fitted_views
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.families import SQUARE, prior_families, typical_hyperprior
@@ -27,13 +27,8 @@ KINDS: dict[str, FieldModes] = {
 }
 
 
-def truth() -> Camera:
-    coefficients = [-0.12, 0.03, 4e-4, -3e-4, 0.0]
-    return Camera.build(focal=(800, 800), center=(645, 476), size=SIZE, coefficients=coefficients, model="opencv5")
-
-
 def capture(count: int = 20) -> Tensor:
-    return printed_views(truth(), BOARD, BOARD.points, count, 11, noise=NOISE)
+    return printed_views(WIDE, BOARD, BOARD.points, count, 11, noise=NOISE)
 
 
 def fitted(modes: FieldModes) -> HybridFit:
@@ -48,7 +43,7 @@ def test_a_camera_is_found_with_each(kind: str) -> None:
     assert found.rms == pytest.approx(NOISE * math.sqrt(2.0), rel=0.12)
     assert found.sigma == pytest.approx(NOISE, rel=0.12)
     # Only Zernike fields know that lenses are round: others leave more between field, focal length and pupil.
-    assert middle_error(found.camera, truth(), 0.8) < (2.5 if kind == "zernike" else 6.0) * NOISE
+    assert middle_error(found.camera, WIDE, 0.8) < (2.5 if kind == "zernike" else 6.0) * NOISE
     assert len(found.hyperparameters) == len(KINDS[kind].hyperprior) + 6
     assert 8 < found.effective < 80
 

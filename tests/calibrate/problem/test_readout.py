@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from hybrid_views import views_of
-from printed_boards import middle_error
+from printed_boards import WIDE, middle_error
 from torch import Tensor
 
 from kcal import Board, Camera
@@ -51,16 +51,11 @@ MOVES = (2e-3, 7e-4, 5e-4, 1e-3)
 RATIO = np.array([-3.0, -2.0, -4.0, -2.5, -1.5])
 
 
-def truth() -> Camera:
-    coefficients = [-0.12, 0.03, 4e-4, -3e-4, 0.0]
-    return Camera.build(focal=(800, 800), center=(645, 476), size=SIZE, coefficients=coefficients, model="opencv5")
-
-
 @functools.cache
 def capture(amplitude: float, count: int = 12, seed: int = 1, noise: float = NOISE) -> Tensor:
     """(V, N, 2) corners of a board, each where the board stood when its row was read."""
     generator, middle, found = torch.Generator().manual_seed(seed), BOARD.points.mean(0), []
-    camera = truth()
+    camera = WIDE
     while len(found) < count:
         u = 2.0 * torch.rand(6, generator=generator, dtype=F64) - 1.0
         turn = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], math.pi * u[2]]))
@@ -320,7 +315,7 @@ def test_motion_is_found_and_taken_out() -> None:
     assert max(found.motion_sigma[2:]) < 4e-3
     assert found.sigma == pytest.approx(NOISE, rel=0.15)
     assert found.rms == pytest.approx(NOISE * math.sqrt(2.0), rel=0.15)
-    assert middle_error(found.camera, truth(), 0.7) < 0.5 * middle_error(still.camera, truth(), 0.7)
+    assert middle_error(found.camera, WIDE, 0.7) < 0.5 * middle_error(still.camera, WIDE, 0.7)
     assert still.sigma > 2.0 * NOISE
     # Residuals of corners that are given again are those of the fit.
     torch.testing.assert_close(found.residuals_of(capture(2e-3)), found.residuals, rtol=0, atol=1e-9)
@@ -462,7 +457,7 @@ def test_motion_is_looked_for_beside_a_fit_of_views_that_stand_still(rate: float
 @pytest.mark.parametrize("columns", [False, True])
 def test_corners_are_read_again_where_a_state_shows_them_elsewhere(columns: bool) -> None:
     """Not for less than asked for: what is known of a problem would be lost."""
-    camera, points = truth(), BOARD.points - BOARD.points.mean(0)
+    camera, points = WIDE, BOARD.points - BOARD.points.mean(0)
     shift = torch.tensor([0.0, 0.0, 0.7], dtype=F64).expand(3, 3)
     state = BoardState.flat(camera.params.detach(), torch.eye(3, dtype=F64).expand(3, 3, 3), shift)
     state = state._replace(motion=torch.zeros(3, MOTION, dtype=F64))

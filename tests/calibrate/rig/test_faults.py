@@ -8,7 +8,7 @@ import re
 
 import pytest
 import torch
-from rig_scenes import CAMERAS, CENTER, NAMES, boards, features, landmarks, normal, tensor
+from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, boards, features, landmarks, normal, see, tensor
 from torch import Tensor
 
 from kcal import Baseline, DegenerateError, InputError, Landmarks, MeasuredPosition, RigData, RigOptions, solve_rig
@@ -84,9 +84,8 @@ class TestSeveralSolutions:
         # On a circle around the cameras' axis, so that the other places are real ones.
         around = tensor([30.0, 0, 0], [-14, 24, 2], [-16, -25, -3])
         marks = landmarks(count=3)
-        look = solve_rig(data(landmarks=landmarks()), STRAIGHT).rotation[0]
-        points = CENTER[:2].mean(0) + (around + tensor(0.0, 0.0, 150.0)) @ look
-        pixels = torch.stack([_seen(points, c) for c in (0, 1)], 1)
+        points = CENTER[:2].mean(0) + (around + tensor(0.0, 0.0, 150.0)) @ ROTATION[0]
+        pixels = torch.stack([see(points, c) for c in (0, 1)], 1)
         with pytest.raises(
             DegenerateError, match=r"do not tell where the cameras stand: right may be .* m or .* m from"
         ):
@@ -186,8 +185,3 @@ class TestContradictions:
         chi2 = [2.0 * float(work.problem(masks).cost(work.part(masks))) for work, masks in (whole, without)]
         sigmas = float(re.findall(r"\(([0-9.]+) standard deviations\)", found.text)[0])
         assert sigmas == pytest.approx(math.sqrt(chi2[0] - chi2[1]), rel=0.02)
-
-
-def _seen(points: Tensor, camera: int) -> Tensor:
-    rotation = solve_rig(data(landmarks=landmarks()), STRAIGHT).rotation[camera]
-    return CAMERAS[camera].project((points - CENTER[camera]) @ rotation.T)[0]

@@ -13,7 +13,18 @@ from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, observe, pix
 from rig_scenes import CAMERAS, landmarks, tensor
 from torch import Tensor
 
-from kcal import Board, Camera, FileError, InputError, RigData, RigOptions, calibrate_rig, load_rig, solve_rig
+from kcal import (
+    Board,
+    Camera,
+    FileError,
+    InputError,
+    Observations,
+    RigData,
+    RigOptions,
+    calibrate_rig,
+    load_rig,
+    solve_rig,
+)
 from kcal.calibrate.problem.state import warp_modes
 from kcal.calibrate.rig.pairs import boards_of_several, pair_by_name, read_pairs
 from kcal.calibrate.rig.result import RigResult
@@ -58,12 +69,15 @@ def labels(count: int) -> list[str]:
     return [" ".join(pair) for pair in names(count)]
 
 
+def observed(pixels: Tensor, board: Board = BOARD) -> list[Observations]:
+    """Of the left and the right camera."""
+    return [observe(pixels[:, c], board=board, names=[pair[c] for pair in names(len(pixels))]) for c in (0, 1)]
+
+
 def solve(
     pixels: Tensor, *, left: Camera = LEFT, right: Camera = RIGHT, board: Board = BOARD, **options: Any
 ) -> RigResult:
-    pairs = names(len(pixels))
-    seen = [observe(pixels[:, c], board=board, names=[pair[c] for pair in pairs]) for c in (0, 1)]
-    return calibrate_rig(left, right, seen[0], seen[1], pairs, RigOptions(**options))
+    return calibrate_rig(left, right, *observed(pixels, board), names(len(pixels)), RigOptions(**options))
 
 
 def off(result: RigResult) -> tuple[float, float]:
@@ -199,8 +213,7 @@ class TestWeights:
             )
             pairs = names(4)
             seen = []
-            for c in (0, 1):
-                plain = observe(pixels[:, c], names=[pair[c] for pair in pairs])
+            for plain in observed(pixels):
                 spread = tuple((float(s) ** 2, 0.0, float(s) ** 2) for s in noise[:, 0])
                 known = tuple(view.model_copy(update={"covariance": spread}) for view in plain.views)
                 seen.append(plain.model_copy(update={"views": known}))
@@ -361,27 +374,18 @@ class TestRefusals:
         other = Camera.build(focal=(800, 800), center=(320, 240), size=SIZE)
         assert "if nothing moved, a camera is wrong" in solve(views(5, 1), right=other).warnings[0]
 
-    def test_boards(self) -> None:
-        pixels = views(3, 1)
-        one = observe(pixels[:, 0], names=["l0", "l1", "l2"])
-        other = observe(pixels[:, 1], names=["r0", "r1", "r2"], board=Board(columns=7, rows=6, square=0.051))
-        with pytest.raises(InputError, match=r"the cameras saw different boards: .*50 mm.*51 mm"):
-            calibrate_rig(LEFT, RIGHT, one, other, names(3))
-
-    def test_image_sizes(self) -> None:
-        pixels = views(3, 1)
-        seen = [observe(pixels[:, c], names=[pair[c] for pair in names(3)]) for c in (0, 1)]
+    def test_views_that_do_not_belong_together(self) -> None:
+        left, right = observed(views(3, 1))
+        _, other = observed(views(3, 1), Board(columns=7, rows=6, square=0.051))
         half = Camera(RIGHT.params, size=(320, 240))
-        with pytest.raises(InputError, match="the right camera has images of 320x240, its observations of 640x480"):
-            calibrate_rig(LEFT, half, seen[0], seen[1], names(3))
-
-    def test_pairs(self) -> None:
-        pixels = views(3, 1)
-        seen = [observe(pixels[:, c], names=[pair[c] for pair in names(3)]) for c in (0, 1)]
-        with pytest.raises(InputError, match="no pair of views"):
-            calibrate_rig(LEFT, RIGHT, seen[0], seen[1], [])
-        with pytest.raises(InputError, match="no view named 'r7'"):
-            calibrate_rig(LEFT, RIGHT, seen[0], seen[1], [("l0", "r7")])
+        for taker, seen, pairs, told in (
+            (RIGHT, other, names(3), r"the cameras saw different boards: .*50 mm.*51 mm"),
+            (half, right, names(3), "the right camera has images of 320x240, its observations of 640x480"),
+            (RIGHT, right, [], "no pair of views"),
+            (RIGHT, right, [("l0", "r7")], "no view named 'r7'"),
+        ):
+            with pytest.raises(InputError, match=told):
+                calibrate_rig(LEFT, taker, left, seen, pairs)
 
     def test_too_few_corners(self) -> None:
         pixels = views(3, 1)
