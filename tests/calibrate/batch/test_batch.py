@@ -309,7 +309,7 @@ class TestJobs:
             read_jobs(folder / "t.csv", BOARD, "opencv5")
 
     def test_no_board_and_no_folders(self, folder):
-        (folder / "t.csv").write_text("camera,images\nb,a\n")
+        (folder / "t.csv").write_text("camera,images\nb,east\n")
         for where, message in ((folder, "no board"), (folder / "t.csv", "camera 'b': no board")):
             with pytest.raises(InputError, match=message):
                 read_jobs(where, None, "opencv5")
@@ -413,7 +413,7 @@ def dask_processes(tmp_path):
 def test_a_scheduler_or_its_last_worker_that_dies_is_an_error(dask_processes, monkeypatch, killed):
     address, scheduler, worker = dask_processes
     monkeypatch.setattr("kcal.calibrate.batch.results._LOOK", 0.5)
-    monkeypatch.setattr("kcal.calibrate.batch.results.WORKERS_BACK", 3.0)
+    monkeypatch.setattr("kcal.calibrate.batch.results.WORKERS_BACK", 1.0)
     with pool(1, address) as workers:
         wait_for(lambda: bool(workers._client.nthreads()))
         threading.Timer(1.0, (scheduler if killed == "scheduler" else worker).kill).start()

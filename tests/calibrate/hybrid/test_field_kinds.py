@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from printed_boards import WIDE, middle_error, printed_views
+from printed_boards import WIDE, middle_error
 from torch import Tensor
 
 from kcal import Board
@@ -14,6 +14,7 @@ from kcal.calibrate.hybrid import fitted_views
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.calibrate.hybrid.families import SQUARE, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
+from kcal.lens import rotation_from_vector
 from kcal.lens.field_modes import FieldModes, GaussianModes, NetworkModes
 from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
@@ -28,7 +29,15 @@ KINDS: dict[str, FieldModes] = {
 
 
 def capture(count: int = 20) -> Tensor:
-    return printed_views(WIDE, BOARD, BOARD.points, count, 11, noise=NOISE)
+    generator, middle, found = torch.Generator().manual_seed(11), BOARD.points.mean(0), []
+    while len(found) < count:
+        u = 2.0 * torch.rand(6, generator=generator, dtype=torch.float64) - 1.0
+        turn = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], math.pi * u[2]]))
+        shift = torch.stack([0.35 * u[3], 0.25 * u[4], 0.6 + 0.1 * u[5]])
+        pixels, valid = WIDE.project((BOARD.points - middle) @ turn.T + shift)
+        if bool((valid & WIDE.inside(pixels)).all()):
+            found.append(pixels + NOISE * torch.randn(pixels.shape, generator=generator, dtype=torch.float64))
+    return torch.stack(found)
 
 
 def fitted(modes: FieldModes) -> HybridFit:

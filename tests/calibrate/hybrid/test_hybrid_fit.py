@@ -232,7 +232,7 @@ def test_weights_follow_residuals_of_the_first_rounds() -> None:
     pixels = views(12, 3)
     given = torch.ones(pixels.shape[:2], dtype=torch.float64)
     given[:, ::2] = 0.3
-    stiff = FitOptions(bending=False, corners=False)
+    stiff = FitOptions(bending=False, corners=False, motion=False)
     known, seen = fit_hybrid(BOARD.points, pixels, SIZE, given, stiff), []
 
     def weigh(residuals: torch.Tensor) -> torch.Tensor:
