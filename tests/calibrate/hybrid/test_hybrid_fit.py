@@ -229,7 +229,7 @@ def test_a_fit_begins_where_another_has_settled() -> None:
 
 
 def test_weights_follow_residuals_of_the_first_rounds() -> None:
-    pixels = views(12, 3)
+    pixels = views(12, 5)
     given = torch.ones(pixels.shape[:2], dtype=torch.float64)
     given[:, ::2] = 0.3
     stiff = FitOptions(bending=False, corners=False, motion=False)
