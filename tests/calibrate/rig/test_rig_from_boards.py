@@ -491,13 +491,8 @@ class TestPairsFile:
         assert str(caught.value).startswith(str(tmp_path / "pairs.csv"))
         assert message in str(caught.value)
 
-    def test_no_file(self, tmp_path: Path) -> None:
-        with pytest.raises(FileError, match="cannot read"):
-            read_pairs(tmp_path / "none.csv", self.LEFT, self.RIGHT)
-        with pytest.raises(FileError, match="cannot read"):
-            read_pairs(tmp_path, self.LEFT, self.RIGHT)
-
-    def test_a_pipe_that_nobody_writes_to(self, tmp_path: Path) -> None:
-        os.mkfifo(tmp_path / "pipe.csv")
-        with pytest.raises(FileError, match="not a regular file"):
-            read_pairs(tmp_path / "pipe.csv", self.LEFT, self.RIGHT)
+    def test_what_is_no_file(self, tmp_path: Path) -> None:
+        os.mkfifo(tmp_path / "pipe.csv")  # to which nobody writes
+        for name, told in (("none.csv", "cannot read"), ("", "cannot read"), ("pipe.csv", "not a regular file")):
+            with pytest.raises(FileError, match=told):
+                read_pairs(tmp_path / name, self.LEFT, self.RIGHT)
