@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from kcal import Board, Camera, Observations, View
 from kcal.lens import rotation_from_vector
+from kcal.lens.calibration import BoardRecord, CalibrationRecord
 
 BOARD = Board(columns=7, rows=6, square=0.05)
 SIZE = (640, 480)
@@ -86,3 +89,11 @@ def observe(
         for name, view in zip(names, pixels, strict=True)
     ]
     return Observations(board=board, image_size=size, views=tuple(views))
+
+
+def calibration_record(board: BoardRecord, **more: Any) -> CalibrationRecord:
+    """Of a calibration from one view."""
+    return CalibrationRecord(
+        rms=0.1, views=1, points=9, per_view_rms={"a": 0.1}, board=board, stop_reason="converged", iterations=3,
+        kcal_version="0.2", created=datetime.datetime.now(datetime.UTC), **more,
+    )  # fmt: skip

@@ -11,6 +11,11 @@ from kcal import Board, Camera
 from kcal.calibrate.hybrid.board_modes import board_modes
 from kcal.lens import rotation_from_vector
 
+# 90 degrees across the diagonal of 1280x960 px, none of ours: opencv5.
+WIDE = Camera.build(
+    focal=(800, 800), center=(645, 476), size=(1280, 960), coefficients=[-0.12, 0.03, 4e-4, -3e-4, 0.0], model="opencv5"
+)
+
 
 def printed_points(board: Board, seed: int, share: float = 5e-4) -> Tensor:
     """(N, 3) corners of a board whose modes are drawn with `share` of their units."""
@@ -49,3 +54,21 @@ def printed_views(
         if seen_whole(camera, pixels, valid):
             out.append(pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64))
     return torch.stack(out)
+
+
+def middle_error(found: Camera, truth: Camera, share: float) -> float:
+    """RMS over a share of the image about its middle of the error at infinity, pixels, after the best rotation."""
+    middle = 0.5 * (torch.tensor(truth.size, dtype=torch.float64) - 1.0)
+    pixels = share * (truth.grid(15, 11).reshape(-1, 2) - middle) + middle
+    (rays, known), (own, seen) = truth.unproject(pixels), found.unproject(pixels)
+    u, _, v = torch.linalg.svd(rays.T @ own)
+    there, valid = found.project_rays(rays @ u @ v)
+    assert bool((known & seen & valid).all())
+    return float((there - pixels).square().sum(-1).mean().sqrt())
+
+
+def shape_error(points: Tensor, true: Tensor) -> float:
+    """RMS distance in meters of two boards, at the best fit of one to the other."""
+    a, b = points - points.mean(0), true - true.mean(0)
+    u, s, vh = torch.linalg.svd(a.T @ b)
+    return float((s.sum() / a.square().sum() * a @ u @ vh - b).square().sum(-1).mean().sqrt())

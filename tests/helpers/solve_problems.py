@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor
@@ -148,3 +149,30 @@ def solve_schur(residual: Residual, start: Tensor, options: LMOptions | None = N
 
 
 SOLVERS = {"dense": solve_dense, "schur": solve_schur}
+
+
+class Scripted:
+    """Elements whose costs and promised decreases are given, trial by trial: (E, T) each; it notes dampings (E,)."""
+
+    joint, residual_count = False, 1
+
+    def __init__(self, costs: Tensor, promised: Tensor, start: float = 1.0, trial: int = 0) -> None:
+        self.costs, self.promised, self.start, self.trial = costs, promised, start, trial
+        self.dampings: list[Tensor] = []
+
+    def linearize(self, state: tuple[Tensor]) -> SimpleNamespace:
+        return SimpleNamespace(cost=torch.full((len(self.costs),), self.start).double(), step=self.step)
+
+    def step(self, damping: Tensor) -> tuple[Tensor, Tensor]:
+        self.dampings.append(damping)
+        return torch.zeros(len(self.costs)).double(), self.promised[:, self.trial]
+
+    def retract(self, state: tuple[Tensor], step: Tensor) -> tuple[Tensor]:
+        return state
+
+    def cost(self, state: tuple[Tensor]) -> Tensor:
+        self.trial += 1
+        return self.costs[:, self.trial - 1]
+
+    def select(self, elements: Tensor) -> Scripted:
+        return Scripted(self.costs[elements], self.promised[elements], self.start, self.trial)

@@ -181,6 +181,16 @@ def quadratic(shared: int, views: int, local: int) -> tuple[Tensor, Tensor]:
     return matrix, torch.randn(size, generator=generator, dtype=torch.float64)
 
 
+def products(matrix: Tensor, shared: int, views: int, local: int) -> SchurLinearization:
+    """Normal equations of which this is the matrix."""
+    gram = torch.zeros(views, local + shared + 1, local + shared + 1, dtype=torch.float64)
+    for v in range(views):
+        which = torch.tensor([*range(shared + v * local, shared + (v + 1) * local), *range(shared)])
+        gram[v, :-1, :-1] = matrix[which[:, None], which]
+        gram[v, local:-1, local:-1] /= views
+    return SchurLinearization.of_gram(gram, local)
+
+
 @pytest.mark.parametrize(("shared", "views", "local"), [(3, 4, 2), (1, 2, 6), (5, 1, 1)])
 def test_a_quadratic_gives_its_matrix_back_and_newton_its_minimum(shared: int, views: int, local: int) -> None:
     matrix, slope = quadratic(shared, views, local)
@@ -191,14 +201,8 @@ def test_a_quadratic_gives_its_matrix_back_and_newton_its_minimum(shared: int, v
 
     # A preconditioner that is a tenth off.
     near = matrix + 0.1 * torch.diag(matrix.diagonal())
-    gram = torch.zeros(views, local + shared + 1, local + shared + 1, dtype=torch.float64)
-    for v in range(views):
-        own = torch.arange(shared + v * local, shared + (v + 1) * local)
-        gram[v, :local, :local] = near[own[:, None], own]
-        gram[v, :local, local:-1] = near[own[:, None], torch.arange(shared)]
-    gram[0, local:-1, local:-1] = near[:shared, :shared]
     zero = torch.zeros(shared, dtype=torch.float64), torch.zeros(views, local, dtype=torch.float64)
-    solve = HessianSolve(cost, SchurLinearization.of_gram(gram, local), zero)
+    solve = HessianSolve(cost, products(near, shared, views, local), zero)
     gradient = solve.gradient()
     torch.testing.assert_close(torch.cat([part.flatten() for part in gradient]), slope, rtol=1e-13, atol=1e-13)
     step = torch.cat([part.flatten() for part in solve(gradient)])
@@ -244,12 +248,7 @@ def test_a_minimum_follows_its_data() -> None:
         return data @ x + 0.5 * x @ matrix @ x
 
     zero = torch.zeros(shared, dtype=torch.float64), torch.zeros(views, local, dtype=torch.float64)
-    gram = torch.zeros(views, local + shared + 1, local + shared + 1, dtype=torch.float64)
-    for v in range(views):
-        which = torch.tensor([*range(shared + v * local, shared + (v + 1) * local), *range(shared)])
-        gram[v, :-1, :-1] = matrix[which[:, None], which]
-        gram[v, local:-1, local:-1] /= views
-    found = HessianSolve(lambda s, own: cost(s, own, slope), SchurLinearization.of_gram(gram, local), zero)
+    found = HessianSolve(lambda s, own: cost(s, own, slope), products(matrix, shared, views, local), zero)
     data = slope.clone().requires_grad_(True)
     step = torch.cat([part.flatten() for part in implicit_step(cost, found, (data,))])
     weight = torch.arange(1.0, len(slope) + 1, dtype=torch.float64)

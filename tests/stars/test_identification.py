@@ -14,7 +14,7 @@ import torch
 from kcal import Camera, FileError, InputError, Origin
 from kcal.locate import enu_from_cam
 from kcal.stars.detect import detect_stars, read_night
-from kcal.stars.night import SkyView, clock_doubts, field_angle, name_stars
+from kcal.stars.night import SkyView, field_angle, name_stars
 from kcal.stars.sky import StarCatalog, _table_of, cache_folder, identify, observed_directions, pair_table
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
 
@@ -114,14 +114,16 @@ def test_eight_bits_name_stars_too(night: Any) -> None:
 def test_fewer_stars_than_tell_have_no_name() -> None:
     pixels, _ = star_pixels(CAMERA, LOOK)
     rays = CAMERA.unproject(torch.from_numpy(pixels[:4]))[0].numpy()
-    assert identify(rays / np.linalg.norm(rays, axis=1, keepdims=True), 1e-3, field=field_angle(CAMERA)) is None
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    assert identify(rays, 1e-3, field=field_angle(CAMERA)) is None
+    assert identify(rays[:3], 1e-4) is None
 
 
 @pytest.mark.parametrize("focal", [900.0, 5000.0])
 def test_random_points_have_no_names(focal: float) -> None:
     generator = np.random.default_rng(int(focal))
     camera = night_camera(focal)
-    for _ in range(8):
+    for _ in range(4):
         pixels = generator.random((int(generator.integers(4, 21)), 2)) * camera.size
         rays = np.c_[(pixels - camera.params[2:4].numpy()) / focal, np.ones(len(pixels))]
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -184,12 +186,10 @@ def test_without_pyerfa(monkeypatch: pytest.MonkeyPatch, night: Any) -> None:
         name_stars(night, CAMERA, SkyView(time=TIME, origin=PLACE))
 
 
-def test_wrong_camera() -> None:
-    pixels, index = star_pixels(CAMERA, LOOK)
-    image = rendered(CAMERA, pixels, CATALOG.magnitude[index])
+def test_wrong_camera(night: Any) -> None:
     other = Camera.build(focal=(1500, 1500), center=(479.5, 299.5), size=(960, 600), model="pinhole")
     with pytest.raises(InputError, match="the camera file is of another lens"):
-        name_stars(image, other)
+        name_stars(night, other)
 
 
 @pytest.mark.parametrize(
@@ -208,23 +208,6 @@ def test_refraction_tells_a_wrong_time_or_place(night: Any, hours: float, degree
         (text,) = found.warnings
         assert text.startswith("refraction is ")
         assert float(text.split()[2]) == pytest.approx(share, abs=0.1)
-
-
-def test_a_fixed_camera_tells_a_wrong_time(night: Any) -> None:
-    later = TIME + datetime.timedelta(hours=2)
-    pixels, index = star_pixels(CAMERA, LOOK, time=later)
-    second = rendered(CAMERA, pixels, CATALOG.magnitude[index], seed=1)
-    first = name_stars(night, CAMERA, SkyView(time=TIME, origin=PLACE))
-    right = name_stars(second, CAMERA, SkyView(time=later, origin=PLACE))
-    summer = name_stars(second, CAMERA, SkyView(time=later + datetime.timedelta(hours=1), origin=PLACE))
-    assert clock_doubts([first, right]) == []
-    ((number, text),) = clock_doubts([first, summer])
-    assert number == 1
-    assert "(1.00 h)" in text
-    # A camera that was turned is no doubt.
-    pixels, index = star_pixels(CAMERA, (140.0, 35.0, 2.0), time=later)
-    moved = name_stars(rendered(CAMERA, pixels, CATALOG.magnitude[index]), CAMERA, SkyView(time=later, origin=PLACE))
-    assert clock_doubts([first, moved]) == []
 
 
 def test_fits(night: Any, tmp_path: Path) -> None:

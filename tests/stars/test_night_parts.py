@@ -25,7 +25,6 @@ from kcal.stars.detect import (
     time_of,
 )
 from kcal.stars.night import _names_at, field_angle
-from kcal.stars.rig_stars import moments_of
 from kcal.stars.sky import Identification, StarCatalog
 
 CAMERA = Camera.build(focal=(1000, 1000), center=(319.5, 239.5), size=(640, 480), model="pinhole")
@@ -61,11 +60,6 @@ PLACES = [(40.0 + 60 * (i % 5) + 0.3, 30.0 + 55 * (i // 5) + 0.2) for i in range
 
 
 class TestStars:
-    def test_a_streak_among_stars_is_left_out(self) -> None:
-        found = detect_stars(sky_of(*((x, y, 1.2, 300.0) for x, y in PLACES[:-1]), (*PLACES[-1], 8.0, 600.0)))
-        assert len(found.pixels) == 19
-        assert found.left_out == {"streaks": 1}
-
     def test_in_a_long_exposure_all_stars_are_streaks(self) -> None:
         found = detect_stars(sky_of(*((x, y, 2.4, 300.0) for x, y in PLACES)))
         assert len(found.pixels) == 20
@@ -91,9 +85,6 @@ class TestNames:
         pixels, reach = np.array([[319.8, 239.5], [100.0, 100.0]]), np.array([2.0, 2.0])
         found = _names_at(pixels, reach, directions, np.array(magnitude), CAMERA, torch.eye(3).double(), 0.8)
         return [int(star) for star in found]
-
-    def test_the_nearest_star_of_the_catalogue(self) -> None:
-        assert self.names([3.0, 3.0], 50.0) == [0, -1]
 
     def test_a_neighbor_of_like_brightness_takes_the_name_away(self) -> None:
         """It pulls the center; one that is 2.5 magnitudes fainter does not, and one that is too far neither."""
@@ -150,35 +141,6 @@ class TestFiles:
         for text, path, message in (("name", image, "zone"), ("name:Z", Path("a.png"), "no time in this name")):
             with pytest.raises(InputError, match=message):
                 time_of(text, path)
-
-
-class Image:
-    """As much of a named image as is put together by its time."""
-
-    def __init__(self, second: float | None, on_earth: bool) -> None:
-        start = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
-        time = None if second is None else start + datetime.timedelta(seconds=second)
-        self.view, self.on_earth = type("View", (), {"time": time}), on_earth
-
-
-class TestMoments:
-    def of(self, *cameras: list[float | None], on_earth: bool = False) -> tuple[list[dict[int, int]], int]:
-        images = [[Image(second, on_earth) for second in own] for own in cameras]
-        found, alone = moments_of(images, tolerance=1.0)  # type: ignore[arg-type]
-        return [{c: images[c].index(one) for c, one in moment.items()} for moment in found], alone  # type: ignore[arg-type]
-
-    def test_by_their_times(self) -> None:
-        assert self.of([0.0, 10.0, 20.0], [10.5, 1.0, 30.0]) == ([{0: 0, 1: 1}, {0: 1, 1: 0}], 2)
-        # On the Earth an image alone is a moment, too; in the order of times.
-        moments = [{0: 0, 1: 1}, {0: 1, 1: 0}, {0: 2}, {1: 2}]
-        assert self.of([0.0, 10.0, 20.0], [10.5, 1.0, 30.0], on_earth=True) == (moments, 2)
-        # Two images of one camera are two moments, however near.
-        assert self.of([0.0, 0.5], [0.2]) == ([{0: 0, 1: 0}], 1)
-
-    def test_in_their_order(self) -> None:
-        assert self.of([None, None], [None, 3.0]) == ([{0: 0, 1: 0}, {0: 1, 1: 1}], 0)
-        with pytest.raises(InputError, match="as many are needed"):
-            self.of([None, None], [3.0])
 
 
 class TestPlans:

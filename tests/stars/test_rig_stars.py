@@ -18,8 +18,6 @@ from kcal.cli.main import app
 from kcal.io.images import write_png
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.locate import enu_from_cam
-from kcal.stars.night import NamedStars, SkyView, name_stars
-from kcal.stars.rig_stars import moments_of, star_source
 from kcal.stars.sky import StarCatalog, pole_in_enu
 from scripts.shared.night_scenes import LOOKS, PLACE, TIME, night_camera, rendered, star_pixels, star_rig
 
@@ -94,27 +92,6 @@ def test_landmarks_tell_a_wrong_time(seconds: float, message: str) -> None:
     assert message in said
 
 
-def test_nights_begin_anew(nights: list[list[NamedStars]]) -> None:
-    """Drift counts in nights of an hour or more, from the first image of each."""
-    camera = night_camera(1100.0, (1280, 800))
-    pair = {side: nights[side][0] for side in (0, 1)}
-
-    def at(hours: float) -> dict[int, NamedStars]:
-        time = TIME + datetime.timedelta(hours=hours)
-        return {c: dataclasses.replace(one, view=dataclasses.replace(one.view, time=time)) for c, one in pair.items()}
-
-    # The second night is of one image.
-    moments = [at(hours) for hours in (0.0, 3.0, 24.0, 48.0, 50.0)]
-    source = star_source(moments, (camera, camera), origin=PLACE, drift_sigma=0.1)
-    drifts = [effect for effect in source.effects if effect.factor is not None]
-    assert [effect.name for effect in drifts] == [f"drift of the clock of camera 2, night {k}" for k in (1, 3)]
-    hours = torch.stack([effect.factor for effect in drifts if effect.factor is not None])
-    assert sorted(set(hours[0].tolist())) == pytest.approx([0.0, 3.0])
-    assert sorted(set(hours[1].tolist())) == pytest.approx([0.0, 2.0])
-    assert not any(effect.factor is not None for effect in star_source(moments[:1], (camera, camera)).effects)
-    assert len(star_source(moments, (camera, camera), drift_sigma=0.0).effects) == len(source.effects) - 2
-
-
 def test_stars_alone_say_what_is_missing() -> None:
     data, _, _ = star_rig(CAMERA, seed=1, named=False, positions=False, matches=0)
     with pytest.raises(DegenerateError, match="add matches of unknown range"):
@@ -136,42 +113,6 @@ def test_wrong_names_and_an_aircraft_are_left_out() -> None:
     assert {item.name for item in found.left_out} == {names[i] for i in (4, 9, 20)}
     assert all(item.source == "stars" for item in found.left_out)
     assert float(turn_error(found, truth).norm()) < 4 * float(found.sigma_rotation.norm())
-
-
-@pytest.fixture(scope="module")
-def nights() -> list[list[NamedStars]]:
-    """Two pairs of rendered images, ten minutes apart."""
-    catalog, camera = StarCatalog.bundled(), night_camera(1100.0, (1280, 800))
-    found: list[list[NamedStars]] = [[], []]
-    for minute in (0, 10):
-        time = TIME + datetime.timedelta(minutes=minute)
-        for side, look in enumerate(LOOKS):
-            pixels, index = star_pixels(camera, look, time, faintest=6.0)
-            image = rendered(camera, pixels, catalog.magnitude[index], seed=10 * side + minute)
-            found[side].append(name_stars(image, camera, SkyView(time=time, origin=PLACE, dut1=0.0)))
-    return found
-
-
-def test_images_become_a_source(nights: list[list[NamedStars]]) -> None:
-    camera = night_camera(1100.0, (1280, 800))
-    moments, alone = moments_of(nights)
-    assert (len(moments), alone) == (2, 0)
-    source = star_source(moments, (camera, camera), origin=PLACE)
-    assert int(source.named.sum()) > 60
-    names = [effect.name for effect in source.effects]
-    assert names[1:] == ["the clocks against UT1", "the air's temperature", "the air's pressure"]
-    one_second = source.effects[0].turn
-    assert float(one_second[1].norm()) == pytest.approx(0.1 * 7.292e-5, rel=1e-3)
-    # A warmer air bends less: stars sink.
-    shift = source.effects[2].shift
-    assert bool((shift[source.named][..., 2] < 0).all())
-
-
-def test_moments_of_unlike_times(nights: list[list[NamedStars]]) -> None:
-    later = [dataclasses.replace(one, view=dataclasses.replace(one.view, time=TIME + datetime.timedelta(hours=1)))
-             for one in nights[1]]  # fmt: skip
-    moments, alone = moments_of([nights[0], later])
-    assert alone == len(moments) == 4
 
 
 @pytest.mark.slow

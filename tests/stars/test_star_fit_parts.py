@@ -14,6 +14,7 @@ from scipy import stats
 
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior, GaussianTerm
 from kcal.calibrate.problem.state import BoardState
+from kcal.errors import InputError
 from kcal.gaussian import Gaussian, triangular
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
@@ -55,7 +56,6 @@ from kcal.stars.sky import (
     observed_directions,
     pair_table,
     pole_in_enu,
-    turn_between,
     unit_vectors,
 )
 from scripts.shared.night_scenes import PLACE, TIME, night_camera, star_pixels
@@ -99,11 +99,14 @@ class TestTurns:
         return found, directions, noise
 
     def test_an_attitude_has_the_covariance_of_its_turn_in_the_world(self) -> None:
-        found, directions, _ = self.fitted(0.3)
+        found, directions, noise = self.fitted(0.3)
         named = found.star >= 0
         assert found.count == int(named.sum()) > 30
         # χ² of residuals in their sigmas over the degrees of freedom.
         off = found.residual[named]
+        there, _ = seen_turned(CAMERA, FAR * directions[found.star[named]], found.rotation)
+        marked = seen_turned(CAMERA, FAR * directions[named], TURN)[0].T.numpy() + noise[named]
+        np.testing.assert_allclose(off, there.T.numpy() - marked, atol=1e-6)
         widened = math.sqrt(((off / 0.1) ** 2).sum() / (2 * len(off) - 3))
         assert found.widened == pytest.approx(widened)
         assert found.widened == pytest.approx(3.0, rel=0.2)
@@ -139,12 +142,15 @@ class TestTurns:
 
 
 class TestRefraction:
+    def directions(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Straight and refracted: straight up they are not bent; lower stars are lifted."""
+        straight, _ = scattered(40)
+        lifted = straight + 2e-3 * torch.stack([0 * straight[:, 0], 0 * straight[:, 0], 1 - straight[:, 2] ** 2], -1)
+        return straight, torch.nn.functional.normalize(lifted, dim=-1)
+
     def doubt(self, share: float, sigma: float = 0.1) -> str | None:
         """Stars that are refracted by a share of what they should be."""
-        straight, _ = scattered(40)
-        # Straight up they are not bent; lower stars are lifted.
-        lifted = straight + 2e-3 * torch.stack([0 * straight[:, 0], 0 * straight[:, 0], 1 - straight[:, 2] ** 2], -1)
-        refracted = torch.nn.functional.normalize(lifted, dim=-1)
+        straight, refracted = self.directions()
         true = torch.nn.functional.normalize(straight + share * (refracted - straight), dim=-1)
         at, seen = (seen_turned(CAMERA, FAR * one, TURN)[0].T.numpy() for one in (refracted, true))
         star = np.arange(40)
@@ -165,9 +171,7 @@ class TestRefraction:
 
     def test_what_a_good_lens_errs_is_no_doubt(self) -> None:
         """However sure: only where the pattern that no turn explains differs by more than .04 px, root mean square."""
-        straight, _ = scattered(40)
-        lifted = straight + 2e-3 * torch.stack([0 * straight[:, 0], 0 * straight[:, 0], 1 - straight[:, 2] ** 2], -1)
-        refracted = torch.nn.functional.normalize(lifted, dim=-1)
+        straight, refracted = self.directions()
         used = torch.arange(40) != 3
         (at, rows), (without, _) = (seen_turned(CAMERA, FAR * one[used], TURN) for one in (refracted, straight))
         pattern, turns = (at - without).flatten().numpy(), rows[:3].flatten(1).T.numpy()
@@ -484,7 +488,6 @@ def test_triangles_have_the_sides_and_the_sense() -> None:
     assert chosen.tolist() in _triangles(corners, table, int(chosen.max()) + 1, 1e-4, 0.0, 0.0).tolist()
     turned = rotation_from_vector(tensor(0.2, -0.4, 0.1)).numpy()
     assert chosen.tolist() in _triangles(corners @ turned.T, table, 500, 1e-4, 0.0, 0.0).tolist()
-    np.testing.assert_allclose(turn_between(corners, corners @ turned.T), turned, atol=1e-12)
 
 
 def test_signal_and_center_of_a_star_by_hand() -> None:
@@ -508,6 +511,8 @@ def test_signal_and_center_of_a_star_by_hand() -> None:
 def test_a_view_needs_a_time_for_its_place() -> None:
     assert SkyView(time=TIME, origin=PLACE).on_earth
     assert not SkyView(time=TIME).on_earth
+    with pytest.raises(InputError, match="a place without a time"):
+        SkyView(origin=PLACE)
     known = SkyView(time=TIME, origin=PLACE, time_sigma=0.3, dut1=0.1)
     assert known.clock_sigma == pytest.approx(0.3)
     assert SkyView(time_sigma=0.4).clock_sigma == pytest.approx(math.hypot(0.4, 0.9 / math.sqrt(3.0)))

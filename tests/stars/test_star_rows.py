@@ -204,5 +204,8 @@ def test_images_of_one_moment() -> None:
     assert alone == 0
     assert [sorted(moment) for moment in moments] == [[0, 2], [0, 2]]
     assert moments[1][2] is plain[1][1]
+    # One without a time is enough.
+    mixed = [plain[0], [plain[1][0], left[0]]]
+    assert moments_of(mixed)[0] == [{0: plain[0][k], 1: mixed[1][k]} for k in (0, 1)]
     with pytest.raises(InputError, match="as many are needed"):
         moments_of([plain[0], plain[1][:1]])

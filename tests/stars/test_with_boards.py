@@ -18,7 +18,7 @@ from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.cli.main import app
 from kcal.io.images import write_png
 from kcal.stars import SkyView
-from kcal.stars.detect import DetectedStars, NightPlan, planned_stars
+from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import StarCamera, calibrate_by_stars, refine_by_stars
 from kcal.stars.lens_fit import StarField, fit_star_lens
 from kcal.stars.sky import StarCatalog, cache_folder, pair_table
@@ -172,16 +172,13 @@ def test_its_uncertainty(found: StarCamera) -> None:
     assert 5 < found.lens.effective < 40
 
 
-def test_points_that_are_no_stars_get_no_names(found: StarCamera) -> None:
-    images, _ = star_images(35.0, 2, seed=1)
-    for image, star in zip(images, found.stars, strict=True):
-        assert 0.7 * (len(image.pixels) - 5) < len(star) <= len(image.pixels) - 5
-
-
 def test_all_pairs_of_bright_stars_are_in_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KCAL_CACHE", str(tmp_path))
-    for field_deg, limit_deg in ((2.0, 3.0), (7.5, 7.0), (70.0, 60.0), (150.0, 60.0)):
-        table = pair_table(StarCatalog.bundled(), np.radians(field_deg))
+    catalog = StarCatalog.bundled()
+    for field_deg, limit_deg in ((3.7, 3.0), (3.8, 5.0), (8.7, 7.0), (8.8, 10.0), (70.0, 60.0), (150.0, 60.0)):
+        table = pair_table(catalog, np.radians(field_deg))
+        # Over eight tenths of the field.
+        assert np.radians(limit_deg) * 0.995 < table.angle[-1] <= np.float32(np.radians(limit_deg))
         assert len(table.pairs) == len(table.angle)
         # Fewer stars take part for wide angles: some 700,000 pairs, each both ways.
         assert len(table.angle) < 2 * 700_000 * 1.2
@@ -193,6 +190,9 @@ def test_all_pairs_of_bright_stars_are_in_the_table(tmp_path: Path, monkeypatch:
         own = (table.pairs < bright).all(1)
         np.testing.assert_allclose(np.sort(table.angle[own]), wanted, atol=1e-4)
         assert np.all(np.diff(table.angle) >= 0)
+    # Each pair both ways, one after the other; the brightest star is the first.
+    assert np.array_equal(table.pairs[::2], table.pairs[1::2, ::-1])
+    assert catalog.name_of(int(catalog.number[table.order[0]])) == "Sirius"
 
 
 @pytest.mark.parametrize(
@@ -219,12 +219,13 @@ REAL = Path(os.environ.get("KCAL_DATA", ""), "stars")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("focal", [None, 1100.0])
-def test_a_lens_from_stars(focal: float | None) -> None:
+def test_a_lens_from_stars() -> None:
     images, views = star_images(35.0, 6, seed=1)
-    found = calibrate_by_stars(images, views, SIZE, focal=focal)
+    found = calibrate_by_stars(images, views, SIZE)
     assert found.images == tuple(range(6))
-    assert all(len(star) > 0.7 * (len(image.pixels) - 5) for star, image in zip(found.stars, images, strict=True))
+    # Of each image five points are no stars.
+    for star, image in zip(found.stars, images, strict=True):
+        assert 0.7 * (len(image.pixels) - 5) < len(star) <= len(image.pixels) - 5
     assert found.lens.rms_px == pytest.approx(0.1, rel=0.15)
     error = lens_difference(found)
     assert np.sqrt((error**2).mean()) < 0.06
@@ -258,22 +259,6 @@ def test_too_few_stars() -> None:
     _, views = star_images(35.0, 1, seed=1)
     with pytest.raises(InputError, match="in none of 1 images stars have names"):
         calibrate_by_stars([nothing], views, SIZE)
-
-
-def test_planned_stars() -> None:
-    """More light and a darker sky give more stars; a level camera sees half of the sky."""
-    plans = {
-        name: planned_stars(NightPlan(focal_px=1600, size=(1920, 1080), aperture_mm=2.9, **more))
-        for name, more in {
-            "plain": {}, "short": {"seconds": 0.25}, "suburb": {"sky_magnitude": 18.0}, "up": {"altitude_deg": 45.0},
-        }.items()
-    }  # fmt: skip
-    plain = plans["plain"]
-    assert plans["short"].stars < 0.5 * plain.stars
-    assert plans["suburb"].stars < 0.7 * plain.stars
-    assert plans["up"].stars > 2 * plain.stars
-    assert plain.range_share(5000.0, 10.0, 1, 1.0) > 0.03
-    assert plain.range_share(5000.0, 10.0, 20) == pytest.approx(plain.range_share(5000.0, 10.0) / 20**0.5)
 
 
 @pytest.mark.slow

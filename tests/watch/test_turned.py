@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from rig_scenes import CAMERAS, CENTER, ROTATION, landmarks, normal, see, spread_points, tensor
+from rig_scenes import CAMERAS, CENTER, ROTATION, landmarks, normal, spread_points, tensor
 from torch import Tensor
 
 from kcal import DegenerateError, Features, InputError, Landmarks, Rig
@@ -57,9 +57,15 @@ def relative_turn(turns: Tensor = TURN) -> Tensor:
     return vector_from_rotation(right @ RELATIVE @ left.T @ RELATIVE.T)
 
 
+def turned_left() -> Tensor:
+    return rotation_from_vector(TURN[0]) @ ROTATION[0]
+
+
 class TestFeatures:
     def test_exact_marks_give_the_turn(self) -> None:
-        found = measure_drift(RIG, features=static(12))
+        found = measure_drift(RIG, features=static(12), pose=(ROTATION[0], CENTER[0]))
+        assert found.cam_from_local is not None
+        torch.testing.assert_close(found.cam_from_local, turned_left(), rtol=0, atol=1e-10)
         assert found.left is not None
         assert found.right is not None
         torch.testing.assert_close(torch.stack([found.left, found.right]), TURN, rtol=0, atol=1e-10)
@@ -71,13 +77,22 @@ class TestFeatures:
         assert found.significant
 
     def test_sigmas_are_the_spread(self) -> None:
-        """16 checks of 15 features: χ² with 48 degrees of freedom, ± 4 of its deviations."""
-        total = 0.0
+        """16 checks of 15 features: χ² of the relative turn, three numbers, and of the pose, ± 4 of its deviations.
+
+        The pose has five: the right camera turns about its center, which stays on a sphere.
+        """
+        relative, pose = 0.0, 0.0
+        onto, shift = rotation_from_vector(relative_turn()), rotation_from_vector(TURN[1])
         for seed in range(0, 16_000, 1000):
             found = measure_drift(RIG, features=static(15, 0.1, seed))
-            error = vector_from_rotation(rotation_from_vector(found.relative) @ rotation_from_vector(-relative_turn()))
-            total += float(error @ torch.linalg.solve(found.relative_covariance, error))
-        assert abs(total - 48) < 4 * (2 * 48) ** 0.5
+            error = vector_from_rotation(rotation_from_vector(found.relative) @ onto.T)
+            relative += float(error @ torch.linalg.solve(found.relative_covariance, error))
+            turn = vector_from_rotation(found.rig.right_from_left_rotation @ (onto @ RELATIVE).T)
+            moved = found.rig.right_from_left_translation - shift @ RIG.right_from_left_translation
+            error = torch.cat([turn, moved])
+            pose += float(error @ torch.linalg.pinv(found.pose_covariance, rtol=1e-9, hermitian=True) @ error)
+        assert abs(relative - 48) < 4 * (2 * 48) ** 0.5
+        assert abs(pose - 80) < 4 * (2 * 80) ** 0.5
 
     def test_no_drift_is_not_significant_and_a_tenth_of_a_pixel_is(self) -> None:
         still = measure_drift(RIG, features=static(40, 0.1, turns=torch.zeros(2, 3).double()))
@@ -113,18 +128,6 @@ class TestFeatures:
         assert not found.significant
         assert found.left_significant
 
-    def test_covariance_of_the_pose_is_the_spread(self) -> None:
-        """12 checks of five free numbers: the right camera turns about its center, which stays on a sphere."""
-        total, shift = 0.0, rotation_from_vector(TURN[1]) @ RIG.right_from_left_translation
-        for seed in range(0, 12_000, 1000):
-            found = measure_drift(RIG, features=static(15, 0.1, seed))
-            turn = vector_from_rotation(
-                found.rig.right_from_left_rotation @ (rotation_from_vector(relative_turn()) @ RELATIVE).T
-            )
-            error = torch.cat([turn, found.rig.right_from_left_translation - shift])
-            total += float(error @ torch.linalg.pinv(found.pose_covariance, rtol=1e-9, hermitian=True) @ error)
-        assert abs(total - 60) < 4 * (2 * 60) ** 0.5
-
     def test_covariances_are_those_of_the_cameras_turns(self) -> None:
         """By autograd through the relative pose that two small turns leave, of cameras that look unlike."""
         points = spread_points(15, 300.0, 8000.0, 11)
@@ -146,12 +149,6 @@ class TestFeatures:
         off = (rows @ own @ rows.T - found.pose_covariance) / (scale[:, None] * scale).sqrt()
         assert float(off.abs().max()) < 5e-3  # turns of 1e-4 rad, to first order; the largest entry is 30
         torch.testing.assert_close(found.relative_covariance, found.pose_covariance[:3, :3], rtol=0, atol=0)
-
-    def test_attitude_in_the_local_frame(self) -> None:
-        found = measure_drift(RIG, features=static(12), pose=(ROTATION[0], CENTER[0]))
-        torch.testing.assert_close(
-            found.cam_from_local, rotation_from_vector(TURN[0]) @ ROTATION[0], rtol=0, atol=1e-10
-        )
 
     def test_what_moved_is_named(self) -> None:
         features = static(20, 0.1)
@@ -179,14 +176,6 @@ class TestFeatures:
 
 
 class TestLandmarks:
-    def test_attitudes_in_the_local_frame(self) -> None:
-        marks = landmarks()
-        marks = dataclasses.replace(marks, pixels=seen(marks.points, TURN))
-        found = measure_drift(RIG, landmarks=marks, pose=(ROTATION[0], CENTER[0]), refraction=(0.0, 0.0))
-        assert found.cam_from_local is not None
-        torch.testing.assert_close(found.cam_from_local, rotation_from_vector(TURN[0]) @ ROTATION[0])
-        torch.testing.assert_close(found.relative, relative_turn(), rtol=0, atol=1e-10)
-
     def test_turns_and_their_covariances_about_the_cameras_own_axes(self) -> None:
         marks = landmarks()
         marks = dataclasses.replace(marks, pixels=seen_rolled(marks.points, TURN))
@@ -232,6 +221,7 @@ class TestLandmarks:
         marks = Landmarks(names=("a", "b"), points=every.points[two], sigma=every.sigma[two], pixels=pixels[two])
         found = measure_drift(RIG, landmarks=marks, pose=(ROTATION[0], CENTER[0]), refraction=(0.0, 0.0))
         torch.testing.assert_close(found.relative, relative_turn(), rtol=0, atol=1e-9)
+        torch.testing.assert_close(found.cam_from_local, turned_left(), rtol=0, atol=1e-9)
 
     def test_how_well_the_rig_was_known_counts(self) -> None:
         marks = landmarks()
@@ -277,7 +267,3 @@ class TestRefusals:
         features.pixels[2, :2] = math.nan
         (item,) = measure_drift(RIG, features=features).left_out
         assert (item.name, item.reason) == ("s2", "no camera has a mark of it both then and now")
-
-
-def test_scene_sees_its_features() -> None:
-    assert bool(torch.isfinite(see(spread_points(20, 300.0, 8000.0, 11), 0)).all())

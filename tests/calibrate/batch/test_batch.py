@@ -7,7 +7,6 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Future
 from unittest.mock import Mock
 
 import cv2
@@ -15,6 +14,7 @@ import interrupted
 import numpy as np
 import pytest
 import torch
+from batch_crew import Here
 from typer.testing import CliRunner
 from waiting import wait_for
 
@@ -64,24 +64,6 @@ def write_images(images, folder):
         (folder / name).mkdir(parents=True)
         for i, shot in enumerate(shots):
             (folder / name / f"{i}.png").write_bytes(shot)
-
-
-class Here:
-    """A pool that works in this process."""
-
-    ahead = 2
-
-    def __init__(self):
-        self.tasks = []
-
-    def submit(self, task):
-        self.tasks.append(task)
-        future = Future()
-        try:
-            future.set_result(task.function(*task.arguments))
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 def run(folder, output, options=None, board=BOARD, model="opencv5"):
@@ -169,28 +151,17 @@ class TestResults:
         assert run(folder, place / "out", BatchOptions(board_warp=True))[1] == 2
         assert run(folder, place / "out", BatchOptions(time_limit=99))[1] == 0
 
-    def test_a_damaged_piece_is_done_again(self, folder, first, place):
-        piece = min((place / "out" / ".work").iterdir())
-        piece.write_text(piece.read_text()[:40])
+    def test_pieces_that_were_edited_or_damaged_are_done_again(self, folder, first, place):
+        pieces = {path: json.loads(path.read_text()) for path in sorted((place / "out" / ".work").iterdir())}
+        camera = next(path for path, content in pieces.items() if content["piece"]["kcal"] == "calibrated")
+        image, damaged, *_ = (path for path, content in pieces.items() if content["piece"]["kcal"] == "detected")
+        pieces[camera]["piece"]["camera"]["intrinsics"]["fx"] += 1.0
+        pieces[image]["piece"]["pixels"][0][0] += 5.0
+        for path in (camera, image):
+            path.write_text(json.dumps(pieces[path]))
+        damaged.write_text(damaged.read_text()[:40])
         again, done = run(folder, place / "out")
-        assert done == 1
-        # If it was a camera, its solution may differ in the last digits.
-        assert [row.rms for row in again] == pytest.approx([row.rms for row in first], rel=1e-6)
-
-    def test_an_edited_piece_is_done_again(self, folder, first, place):
-        edited = 0
-        for piece in sorted((place / "out" / ".work").iterdir()):
-            content = json.loads(piece.read_text())
-            inside = content["piece"]
-            if inside["kcal"] == "calibrated" and not edited:
-                inside["camera"]["intrinsics"]["fx"] += 1.0
-                edited += 1
-            elif inside["kcal"] == "detected" and edited < 2:
-                inside["pixels"][0][0] += 5.0
-                edited += 1
-            piece.write_text(json.dumps(content))
-        again, done = run(folder, place / "out")
-        assert done == edited == 2
+        assert done == 3
         assert [row.fx for row in again] == pytest.approx([row.fx for row in first], rel=1e-6)
 
     def test_no_cell_of_the_table_is_a_formula(self, tmp_path):
@@ -305,16 +276,19 @@ class TestJobs:
     def test_table(self, folder, place):
         table = folder / "cameras.csv"
         table.write_text(
-            "camera,images,board,square,model\n"
-            "a,east,6x5,20mm,\n"
+            "\ufeffcamera, images,board,square,model\n"
+            " a , east ,6x5,20mm,\n"
             "b,west/*.png,,,opencv4\n"
             "c,nowhere/*.png,,,\n"
+            "d,east,nonsense,20mm,\n"
         )  # fmt: skip
         jobs = read_jobs(table, Board(columns=6, rows=5, square=0.1), "opencv8")
-        assert [job.name for job in jobs] == ["a", "b", "c"]
+        assert [job.name for job in jobs] == ["a", "b", "c", "d"]
+        # A board that is wrong stays with its camera.
+        assert [bool(job.error) for job in jobs] == [False, False, True, True]
         assert [job.model for job in jobs[:2]] == ["opencv8", "opencv4"]
         assert [job.board.square for job in jobs[:2]] == [0.02, 0.1]
-        assert [len(job.images) for job in jobs] == [4, 4, 0]
+        assert [len(job.images) for job in jobs[:3]] == [4, 4, 0]
         assert "no such file" in jobs[2].error or "no file matches" in jobs[2].error
 
     @pytest.mark.parametrize(
@@ -326,16 +300,19 @@ class TestJobs:
             ("camera,images\na,east,\n", "line 2: 2 fields"),
             ("camera,images\na,east\na,west\n", "two cameras"),
             ("camera,images\n../a,east\n", "cannot name a camera"),
+            ("camera,images\n\xff,a\n", "not UTF-8"),
         ],
     )
     def test_bad_tables(self, folder, text, message):
-        (folder / "t.csv").write_text(text)
+        (folder / "t.csv").write_text(text, encoding="latin-1")
         with pytest.raises(KcalError, match=message):
             read_jobs(folder / "t.csv", BOARD, "opencv5")
 
     def test_no_board_and_no_folders(self, folder):
-        with pytest.raises(InputError, match="no board"):
-            read_jobs(folder, None, "opencv5")
+        (folder / "t.csv").write_text("camera,images\nb,east\n")
+        for where, message in ((folder, "no board"), (folder / "t.csv", "camera 'b': no board")):
+            with pytest.raises(InputError, match=message):
+                read_jobs(where, None, "opencv5")
         with pytest.raises(FileError, match="no folders"):
             read_jobs(folder / "east", BOARD, "opencv5")
         with pytest.raises(FileError, match="cannot read"):
@@ -436,7 +413,7 @@ def dask_processes(tmp_path):
 def test_a_scheduler_or_its_last_worker_that_dies_is_an_error(dask_processes, monkeypatch, killed):
     address, scheduler, worker = dask_processes
     monkeypatch.setattr("kcal.calibrate.batch.results._LOOK", 0.5)
-    monkeypatch.setattr("kcal.calibrate.batch.results.WORKERS_BACK", 3.0)
+    monkeypatch.setattr("kcal.calibrate.batch.results.WORKERS_BACK", 1.0)
     with pool(1, address) as workers:
         wait_for(lambda: bool(workers._client.nthreads()))
         threading.Timer(1.0, (scheduler if killed == "scheduler" else worker).kill).start()

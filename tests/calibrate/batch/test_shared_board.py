@@ -6,13 +6,13 @@ import csv
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from batch_crew import Here
 from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 
 from kcal.calibrate.batch import results as module
@@ -26,11 +26,11 @@ from kcal.calibrate.batch.jobs import (
     read_jobs,
     sharing_jobs,
 )
-from kcal.calibrate.batch.results import Results, Task, calibrate_batch, run_tasks
+from kcal.calibrate.batch.results import Results, calibrate_batch, run_tasks
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.corners.board import Board
 from kcal.corners.observations import Observations
-from kcal.errors import DegenerateError, FileError, InputError
+from kcal.errors import DegenerateError
 from kcal.io.camera_file import load_camera
 
 NAMES = ("east", "west", "lone")
@@ -46,24 +46,6 @@ SEEN = {
 def solved(model: str) -> dict[str, CameraCalibrationResult]:
     """As if cameras were alone (opencv4), and with what others tell of their board (pinhole)."""
     return {name: calibrate_camera(SEEN[name], CalibrationOptions(model=model)) for name in NAMES}
-
-
-class Here:
-    """Workers that are this process."""
-
-    ahead = 2
-
-    def __init__(self) -> None:
-        self.done: list[str] = []
-
-    def submit(self, task: Task) -> Future[Any]:
-        self.done.append(task.function.__name__)
-        future: Future[Any] = Future()
-        try:
-            future.set_result(task.function(*task.arguments))
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 def name_of(seen: Observations) -> str:
@@ -216,23 +198,3 @@ def test_which_cameras_may_share_a_board() -> None:
     assert sharing_jobs(jobs) == [[0, 4], [1, 5]]
     # No images here: one for each that can be calibrated, and one for each that shares.
     assert pieces(jobs) == 6 + 4
-
-
-def test_tables_of_cameras(tmp_path: Path) -> None:
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "0.png").write_bytes(b"x")
-    table = tmp_path / "cameras.csv"
-    table.write_bytes("\ufeffcamera, images, model\n b , a ,\nc,a,opencv4\n".encode())
-    jobs = read_jobs(table, BOARD, "opencv8")
-    assert [(job.name, job.model, len(job.images)) for job in jobs] == [("b", "opencv8", 1), ("c", "opencv4", 1)]
-    table.write_bytes(b"camera,images\n\xff,a\n")
-    with pytest.raises(FileError, match="not UTF-8"):
-        read_jobs(table, BOARD, "opencv8")
-    table.write_text("camera,images\nb,a\n")
-    with pytest.raises(InputError, match="camera 'b': no board"):
-        read_jobs(table, None, "opencv8")
-    # A board that is wrong stays with its camera.
-    table.write_text("camera,images,board,square\nb,a,nonsense,20mm\nc,a,6x5,20mm\n")
-    wrong, good = read_jobs(table, None, "opencv8")
-    assert wrong.error
-    assert good.board == Board(columns=6, rows=5, square=0.02)

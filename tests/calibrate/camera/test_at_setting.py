@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from calibrate_scenes import camera, motions, observe, pixels_of
+from calibrate_scenes import calibration_record, camera, motions, observe, pixels_of
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from kcal import Camera, InputError, Rig, calibrate_camera, load_camera, load_rig, save_camera, save_rig
 from kcal.calibrate.camera.at_setting import SettingSpline, _errors, camera_at_setting
-from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, LensSetting
+from kcal.lens.calibration import BoardRecord, CameraCalibration, LensSetting
 from kcal.lens.information import CameraInformation
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 
@@ -143,22 +143,6 @@ def test_errors_go_through_as_they_do_by_differences() -> None:
     assert float(by_motor[0, 0]) == pytest.approx(float(moved.square().sum()), rel=0.1)
 
 
-def record(columns: int = 7) -> CalibrationRecord:
-    import datetime
-
-    return CalibrationRecord(
-        rms=0.1,
-        views=1,
-        points=9,
-        per_view_rms={"a": 0.1},
-        board=BoardRecord(columns=columns, rows=6, square=0.05),
-        stop_reason="converged",
-        iterations=3,
-        kcal_version="0.2",
-        created=datetime.datetime.now(datetime.UTC),
-    )
-
-
 def test_one_board_is_wrong_at_all_settings_alike() -> None:
     """The focal length follows the board's size: errors of one board add, those of several average."""
 
@@ -178,7 +162,8 @@ def test_one_board_is_wrong_at_all_settings_alike() -> None:
         for focus, count in zip((0.0, 1.0, 2.0, 3.0), columns, strict=True):
             made = Camera.build(focal=(500 + focus,) * 2, center=(320, 240), size=SIZE, model="pinhole")
             stood = LensSetting(values={"focus": focus})
-            made.calibration = CameraCalibration(information=known(focus), setting=stood, record=record(count))
+            record = calibration_record(BoardRecord(columns=count, rows=6, square=0.05))
+            made.calibration = CameraCalibration(information=known(focus), setting=stood, record=record)
             cameras.append(made)
         found = camera_at_setting(cameras, {"focus": middle}).camera.calibration
         return float(found.covariance[0, 0].sqrt())

@@ -287,12 +287,11 @@ class TestDegenerate:
             torch.testing.assert_close(found.camera.params, alone.camera.params, rtol=1e-7, atol=1e-9)
             assert found.per_view_rms.isnan().tolist() == [False, False, False, True, False]
 
-    @pytest.mark.parametrize("seen", [range(7), range(8), range(0, 42, 7), range(0, 41, 8)])
-    def test_corners_on_one_line(self, seen: range) -> None:
+    def test_corners_on_one_line(self) -> None:
         """The pose of such a view is open, and would spoil all others."""
         truth = camera()
         pixels = pixels_of(truth, motions(truth, 5, 1), noise=0.1)
-        pixels[3, [i for i in range(BOARD.corners) if i not in seen]] = torch.nan
+        pixels[3, [i for i in range(BOARD.corners) if i % 7]] = torch.nan
         assert "lie on one line" in _left_out(solve(pixels))["v03"]
 
     def test_too_few_corners_in_all(self) -> None:
@@ -310,11 +309,6 @@ class TestDegenerate:
         assert _left_out(solve(pixels)) == {"v02": "its corners coincide, or the board is seen edge-on"}
         pixels[2, :, 0] = torch.linspace(50, 500, BOARD.corners).double()
         assert _left_out(solve(pixels)) == {"v02": "its corners coincide, or the board is seen edge-on"}
-
-    def test_noise_alone(self) -> None:
-        pixels = 400.0 * torch.rand(6, BOARD.corners, 2, generator=torch.Generator().manual_seed(1)).double()
-        with pytest.raises((InputError, DegenerateError)):
-            solve(pixels)
 
 
 class TestWarnings:

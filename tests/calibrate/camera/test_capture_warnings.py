@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from calibrate_scenes import observe
 
 from kcal import Board, Camera, InputError, Observations, View
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
@@ -55,17 +56,15 @@ def unequal(factor: float, board: Board, roll: float = math.pi, aspect: float = 
     camera = Camera.build(focal=(900, 900 * aspect), center=(644, 476), size=(1280, 960), coefficients=[-0.1, 0.02])
     generator, views = torch.Generator().manual_seed(7), []
     points = (board.points - board.points.mean(0)) * torch.tensor([factor, 1.0, 1.0])
-    for i in range(12):
+    for _ in range(12):
         u = 2.0 * torch.rand(6, generator=generator, dtype=torch.float64) - 1.0
         tilt = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], 0.0 * u[0]]))
         rotation = tilt @ rotation_from_vector(roll * u[2] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
         center = torch.stack([0.08 * u[3], 0.05 * u[4], 0.45 + 0.1 * u[5]])
         pixels = camera.project(points @ rotation.T + center)[0]
         noisy = pixels + 0.05 * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
-        inside = camera.inside(noisy).tolist()
-        seen = [(u, v) if ok else None for (u, v), ok in zip(noisy.tolist(), inside, strict=True)]
-        views.append(View(name=f"{i}.png", pixels=seen))
-    return Observations(board=board, image_size=camera.size, views=tuple(views))
+        views.append(torch.where(camera.inside(noisy)[:, None], noisy, torch.nan))
+    return observe(torch.stack(views), board=board, size=camera.size)
 
 
 ASYMMETRIC = Board(columns=4, rows=11, square=0.02, pattern="asymmetric")

@@ -11,17 +11,17 @@ import pytest
 import torch
 from calibrate_scenes import SIZE, camera, motions, observe, pixels_of
 from lenses import HYBRID, strong
-from torch import Tensor
+from printed_boards import printed_views
 from typer.testing import CliRunner
 
-from kcal import Board, CalibrationOptions, Camera, DegenerateError, InputError, Observations, View, calibrate_camera
+from kcal import Board, CalibrationOptions, Camera, DegenerateError, InputError, Observations, calibrate_camera
 from kcal.calibrate.camera.advice import possible_views
 from kcal.calibrate.camera.at_setting import ComparisonResult, compare_models
 from kcal.calibrate.camera.checks import OutlierRejection
 from kcal.cli.main import app
 from kcal.corners.marker_boards import _opencv_board
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
-from kcal.lens import camera_difference, refit_camera, rotation_from_vector
+from kcal.lens import camera_difference, refit_camera
 from kcal.lens.uncertainty import paraxial_focal
 from scripts.shared.printed_board import Paper, pose
 
@@ -78,18 +78,11 @@ def capture(count: int = 12, bend: float = 0.0, spread: bool = False) -> Observa
     middle = points.mean(0)
     a, b = ((points - middle) / (points.amax(0) - middle).clamp_min(1e-9))[:, :2].T
     points[:, 2] = bend * a * b
-    generator = torch.Generator().manual_seed(3)
-    views: list[View] = []
-    while len(views) < count:
-        u = 2.0 * torch.rand(6, dtype=torch.float64, generator=generator) - 1.0
-        turn = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], math.pi * u[2]]))
-        shift = torch.stack([0.25 * u[3], 0.18 * u[4], 0.5 + 0.1 * u[5]])
-        pixels, valid = camera.project((points - middle) @ turn.T + shift)
-        if bool((valid & camera.inside(pixels)).all()):
-            noise: Tensor = torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
-            covariance = tuple((NOISE**2, 0.0, NOISE**2) for _ in pixels) if spread else None
-            views.append(View(name=f"{len(views)}", pixels=(pixels + NOISE * noise).tolist(), covariance=covariance))
-    return Observations(board=BOARD, image_size=COMPARED_SIZE, views=tuple(views))
+    seen = observe(printed_views(camera, BOARD, points, count, 3, noise=NOISE), board=BOARD, size=COMPARED_SIZE)
+    known = ((NOISE**2, 0.0, NOISE**2),) * len(points) if spread else None
+    return seen.model_copy(
+        update={"views": tuple(view.model_copy(update={"covariance": known}) for view in seen.views)}
+    )
 
 
 @pytest.mark.slow
@@ -137,7 +130,7 @@ def test_groups() -> None:
 
 
 def test_models_that_cannot_be_fitted_are_infinite_and_named() -> None:
-    few = capture().subset(["0", "1", "2", "3"])
+    few = capture().subset(capture().names[:4])
     with pytest.raises(DegenerateError):
         compare_models(few, ["opencv5"], groups="views", parts=2)
     for names in ([], ["opencv5", "opencv5"]):

@@ -120,7 +120,7 @@ def test_the_start_does_not_matter() -> None:
     seen = observe(pixels_of(TRUTH, motions(TRUTH, 15, 7), noise=0.2))
     ends = [
         calibrate_camera(seen, CalibrationOptions(model="ext20", weak_prior=0.3, focal=focal))
-        for focal in (None, 250.0, 400.0, 700.0, 1100.0)
+        for focal in (None, 250.0, 1100.0)
     ]
     assert max(apart(ends[0], end) for end in ends[1:]) < SAME
 

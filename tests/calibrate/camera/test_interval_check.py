@@ -122,10 +122,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 @pytest.mark.slow
 def test_command(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    result: CameraCalibrationResult,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], result: CameraCalibrationResult
 ) -> None:
     """Interrupted, continued, drawn, and told; against a second capture, and against one of another lens."""
     monkeypatch.chdir(tmp_path)

@@ -62,6 +62,8 @@ def test_a_differentiable_camera_is_a_camera() -> None:
     plain, attached = found.camera(), found.camera(differentiable=True)
     assert not list(attached.parameters())
     assert plain.fingerprint == attached.fingerprint
+    points = torch.tensor([[0.3, 0.2, 1.0], [-0.4, 0.1, 1.0]], dtype=torch.float64)
+    torch.testing.assert_close(plain.project(points)[0], found.project(points)[0].detach(), rtol=0, atol=1e-9)
     again = Camera(plain.params + 1.0, size=plain.size, model=plain.model)
     again.load_state_dict(attached.state_dict())
     assert torch.equal(again.params, plain.params)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from calibrate_scenes import observe
 from torch import Tensor
 
 from kcal.calibrate.camera import each_view
@@ -16,7 +17,7 @@ from kcal.calibrate.camera import one_camera as module
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.calibrate.camera.result import CalibrationOptions
 from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
+from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
@@ -51,8 +52,7 @@ def capture(
     """A capture some of whose views another camera took, or were changed."""
     pixels, own = shown(lens, seed), sorted(second)
     pixels[own] = shown(other, seed)[own] if change is None else change(pixels[own])
-    views = tuple(View(name=f"{i:02d}", pixels=tuple(map(tuple, one))) for i, one in enumerate(pixels.tolist()))
-    return Observations(board=BOARD, image_size=SIZE, views=views)
+    return observe(pixels, board=BOARD, size=SIZE, names=[f"{i:02d}" for i in range(VIEWS)])
 
 
 MIDDLE = 0.5 * (torch.tensor(SIZE, dtype=torch.float64) - 1.0)
@@ -122,11 +122,9 @@ class TestGroups:
 
     def test_one_wrong_corner_makes_no_other_camera(self) -> None:
         seen = capture(second=())
-        views = list(seen.views)
-        pixels = torch.tensor(views[4].pixels, dtype=torch.float64)
-        pixels[7, 0] += 9.0
-        views[4] = View(name=views[4].name, pixels=tuple(map(tuple, pixels.tolist())))
-        result = calibrate_camera(seen.model_copy(update={"views": tuple(views)}))
+        pixels = seen.pixels()
+        pixels[4, 7, 0] += 9.0
+        result = calibrate_camera(observe(pixels, board=BOARD, size=SIZE, names=seen.names))
         assert result.rejected_views == ()
         assert any("corner 7 of view 04 by" in text for text in result.warnings)
 
@@ -205,8 +203,7 @@ class TestNotAccused:
         place = torch.tensor([0.0, 0.0, 4.0]) + normal(24, 3) * torch.tensor([0.35, 0.2, 0.4])
         pixels = lens.project((board.points - board.points.mean(0)) @ turn + place[:, None])[0]
         pixels = pixels + 0.1 * normal(*pixels.shape)
-        views = tuple(View(name=str(i), pixels=tuple(map(tuple, one))) for i, one in enumerate(pixels.tolist()))
-        result = calibrate_camera(Observations(board=board, image_size=size, views=views))
+        result = calibrate_camera(observe(pixels, board=board, size=size))
         assert result.hybrid.tempering > 1.02  # or nothing is tested
         assert result.by_view is None
 

@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 from calibrate_scenes import observe
-from printed_boards import printed_points, printed_views
+from printed_boards import middle_error, printed_points, printed_views, shape_error
 from torch import Tensor
 
 from kcal import Board, Camera, InputError, Observations
@@ -39,13 +39,6 @@ def camera(seed: int) -> Camera:
 def seen_by(truth: Camera, points: Tensor, count: int, seed: int, turns: Tensor | None = None) -> Observations:
     pixels = printed_views(truth, BOARD, points, count, seed, noise=NOISE, pupil=2e-3)
     return observe(pixels if turns is None else turned_corners(pixels, BOARD, turns), board=BOARD, size=SIZE)
-
-
-def shape_error(points: Tensor, true: Tensor) -> float:
-    """RMS distance in meters of two boards, at the best fit of one to the other."""
-    a, b = points - points.mean(0), true - true.mean(0)
-    u, s, vh = torch.linalg.svd(a.T @ b)
-    return float((s.sum() / a.square().sum() * a @ u @ vh - b).square().sum(-1).mean().sqrt())
 
 
 def deviations(fit: HybridFit) -> Tensor:
@@ -117,16 +110,6 @@ def test_turned_views_are_found_within_and_between_cameras() -> None:
     assert shape_error(there, PRINT) < 3e-5
 
 
-def far_error(found: Camera, true: Camera) -> float:
-    """RMS distance in pixels of points at infinity over the image's middle, after the best-fit rotation."""
-    pixels = true.grid(15, 11).reshape(-1, 2)
-    middle = 0.5 * torch.tensor(SIZE, dtype=torch.float64)
-    pixels = pixels[(pixels - middle).norm(dim=-1) < 0.75 * float(middle.norm())]
-    there, here = true.unproject(pixels)[0], found.unproject(pixels)[0]
-    u, _, vh = torch.linalg.svd(there.T @ here)
-    return float(true.focal[0]) * float((here @ (u @ vh).T - there).square().sum(-1).mean().sqrt())
-
-
 @pytest.mark.slow
 def test_a_measured_board_helps_the_next_camera() -> None:
     """Five views with the board that two others measured, against five views alone and against a wrong board."""
@@ -138,7 +121,7 @@ def test_a_measured_board_helps_the_next_camera() -> None:
         # Five views would be allowed the motion of a hand; these stood still.
         still = [FitOptions(modes=MODES, board=kind, motion=False) for kind in kinds]
         fits = [fit_hybrid(BOARD.points, seen.pixels(), SIZE, options=options) for options in still]
-        errors.append([far_error(fit.camera, camera(seed)) for fit in fits])
+        errors.append([middle_error(fit.camera, camera(seed), 0.75) for fit in fits])
     known, alone = torch.tensor(errors).square().mean(0).sqrt().tolist()
     assert known < 0.7 * alone
     right = fit_cameras([seen], FitOptions(modes=MODES, board=board))
@@ -183,7 +166,7 @@ def test_a_fleet_knows_its_lens() -> None:
             fit_hybrid(flat, pixels, SIZE, options=FitOptions(modes=MODES, board="exact", lens=lens))
             for lens in (fleet.lens, None)
         ]
-        errors.append([far_error(fit.camera, camera(seed)) for fit in fits])
+        errors.append([middle_error(fit.camera, camera(seed), 0.75) for fit in fits])
     known, alone = torch.tensor(errors).square().mean(0).sqrt().tolist()
     assert known < 0.85 * alone
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcal import Board, InputError
 from kcal.calibrate.hybrid.base_fit import Base, _through_base, _with_constants
-from kcal.calibrate.hybrid.board_modes import KNOWN, board_modes, undetermined_modes
+from kcal.calibrate.hybrid.board_modes import BENDING, KNOWN, PRINT, STRETCH, TRAPEZOID, board_modes, undetermined_modes
 from kcal.calibrate.hybrid.cameras_fit import _but_one, fleet_priors, typical_lens
 from kcal.calibrate.hybrid.evidence import Amplitudes, Quadratic, overdispersion, posterior_root, still_data, view_data
 from kcal.calibrate.hybrid.families import LensPrior, PriorFamilies, prior_families, typical_hyperprior
@@ -190,6 +190,9 @@ class TestBoards:
         x, y = (points[29] - middle)[:2].tolist()
         wanted = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, x], [0, 0, y], [-y, x, 0], [x, y, 0]]
         assert modes[:, :, 29].tolist() == [pytest.approx(row) for row in wanted]
+        # None is among those that boards have.
+        both = torch.cat([modes, board_modes(points).shapes]).flatten(1)
+        assert int(torch.linalg.matrix_rank(both / both.norm(dim=1, keepdim=True), rtol=1e-6)) == 7 + 28
 
     def test_modes_by_their_corners(self) -> None:
         """Legendre's polynomials of a corner's place, each with its unit in extents of the board."""
@@ -200,6 +203,7 @@ class TestBoards:
         def p(n: int, t: float) -> float:
             return float(np.polynomial.legendre.Legendre.basis(n)(t))
 
+        assert modes.family.tolist() == [BENDING] * 12 + [STRETCH] * 2 + [PRINT] * 2 + [TRAPEZOID] * 2 + [PRINT] * 10
         bending = [(i, d - i) for d in (2, 3, 4) for i in range(d + 1)]
         printed = [(i, d - i) for d in (2, 3) for i in range(d + 1)]
         wanted = [[0, 0, p(i, a) * p(j, b)] for i, j in bending] + [[a, 0, 0], [b, 0, 0]]

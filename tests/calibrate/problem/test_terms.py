@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
-from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
+from calibrate_scenes import camera, motions, observe, pixels_of
 from torch import Tensor
 
-from kcal import InputError, Observations
+from kcal import Observations
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FoldBarrier, GaussianPrior, Term
-from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.problem.views import free_parameters, whitening
 from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.pose import apply_twist
 from kcal.solve import RobustLoss
-from kcal.solve.lm import LMOptions, minimize
 
 # Steps along twists, barriers before folds, and priors as residuals.
 
@@ -147,7 +143,7 @@ def test_a_barrier_counts_in_proportion_to_its_weight_and_grows_towards_the_fold
     assert float(rows[-1].max()) == pytest.approx(0.1 * torch.log(torch.tensor(0.1 / q)).item(), rel=1e-5)
 
 
-# Robust losses, and a focal length given as a hint.
+# Robust losses, and weights.
 
 
 KINDS = ("huber", "cauchy", "tukey")
@@ -173,43 +169,6 @@ def test_wrong_corners_hardly_matter(kind: str) -> None:
     assert result.weighted_rms < 0.5 * result.rms
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_solver_stops_where_the_robust_cost_is_flat(kind: str) -> None:
-    """Its gradient by autograd through the residuals, not through the rows that the solver used."""
-    truth = camera()
-    poses = motions(truth, 6, 5)
-    pixels = pixels_of(truth, poses, noise=0.1, seed=2)
-    pixels[0, 3] += 2.0
-    loss = RobustLoss(kind=kind, scale=0.3)
-    problem = BoardProblem(BOARD.points, pixels, truth.model, free_parameters(truth.model), loss=loss)
-    start = BoardState.flat(truth.params.detach(), *poses)
-    result = minimize(problem, start, LMOptions(tolerance=1e-15))
-    steps = (torch.zeros(problem.shared_size).double(), torch.zeros(6, 6).double())
-
-    def cost(*step: torch.Tensor) -> torch.Tensor:
-        return problem.cost(problem.retract(result.state, step))
-
-    gradient = torch.func.grad(cost, argnums=(0, 1))(*steps)
-    before = torch.func.grad(lambda *step: problem.cost(problem.retract(start, step)), argnums=(0, 1))(*steps)
-    for now, then in zip(gradient, before, strict=True):
-        assert float(now.norm()) < 1e-4 * float(then.norm())
-
-
-def test_a_focal_hint_is_tried_first_and_changes_nothing_else() -> None:
-    truth = camera()
-    seen = observe(pixels_of(truth, motions(truth, 10, 5), noise=0.1, seed=2))
-    plain = calibrate_camera(seen, CalibrationOptions(model="opencv5"))
-    for focal in (350.0, 500.0, 800.0):
-        hinted = calibrate_camera(seen, CalibrationOptions(model="opencv5", focal=focal))
-        assert hinted.rms == pytest.approx(plain.rms, rel=1e-9)
-        torch.testing.assert_close(hinted.camera.focal, plain.camera.focal, rtol=1e-6, atol=0)
-
-
-def test_refusals() -> None:
-    with pytest.raises(InputError, match="focal must be positive"):
-        CalibrationOptions(model="opencv5", focal=-3.0)
-
-
 def with_covariance(seen, sigma):
     """The observations with a covariance of sigma² (V,) for each view's corners."""
     views = []
@@ -227,18 +186,6 @@ def mixed(seed):
     exact = pixels_of(truth, poses)
     noise = torch.randn(exact.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return truth, with_covariance(observe(exact + sigma[:, None, None] * noise), sigma)
-
-
-def test_weights_follow_the_covariances():
-    generator = torch.Generator().manual_seed(0)
-    root = torch.randn(3, 5, 2, 2, generator=generator, dtype=torch.float64)
-    covariances = root @ root.mT + 0.1 * torch.eye(2, dtype=torch.float64)
-    own = float(covariances.diagonal(dim1=-2, dim2=-1).mean())
-    W = whitening(covariances, own + 0.3)
-    product = W @ (covariances + 0.3 * torch.eye(2, dtype=torch.float64)) @ W.mT
-    scale = product[0, 0, 0, 0]
-    torch.testing.assert_close(product, scale * torch.eye(2).double().expand_as(product), rtol=1e-12, atol=1e-12)
-    assert float((W.mT @ W).diagonal(dim1=-2, dim2=-1).mean()) == pytest.approx(1.0, abs=1e-12)
 
 
 def test_equal_covariances_change_nothing():
@@ -271,34 +218,3 @@ def test_weights_beat_no_weights_and_know_their_error():
     assert float(good) < 0.4 * float(bad)
     # 16 numbers, of which four at a time depend on each other.
     assert 0.4 < float(torch.stack(pull).square().mean().sqrt()) < 1.8
-
-
-def test_rows_are_the_derivatives_of_weighted_residuals():
-    truth = camera()
-    rotation, translation = motions(truth, 3, 2)
-    pixels = pixels_of(truth, (rotation, translation), noise=0.2)
-    pixels[1, 4] = torch.nan
-    root = torch.randn(*pixels.shape, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    weights = torch.where(torch.isnan(pixels)[..., None], torch.nan, root)
-    board = observe(pixels).board.points
-    free = [0, 1, 2, 3, 5, 6]
-    problem = BoardProblem(board, pixels, truth.model, free, weights=weights)
-    state = BoardState.flat(
-        truth.params.detach() + 0.01,
-        rotation_from_vector(torch.full((3, 3), 1e-3, dtype=torch.float64)) @ rotation,
-        translation + 1e-3,
-    )
-    errors = problem.pixel_errors(state).mT  # (V, N, 2)
-    by_hand = (torch.nan_to_num(weights) @ errors[..., None])[..., 0]
-    torch.testing.assert_close(problem.residuals(state), by_hand.mT.flatten(-2), rtol=1e-12, atol=1e-12)
-    rows = problem.rows(state)
-    torch.testing.assert_close(rows[:, -1], problem.residuals(state), rtol=1e-12, atol=1e-12)
-    step = 1e-6
-    for k in range(problem.shared_size):
-        shared, local = torch.zeros(problem.shared_size).double(), torch.zeros(3, 6).double()
-        shared[k] = step * max(1.0, float(state.parameters[free[k]]))
-        plus = problem.residuals(problem.retract(state, (shared, local)))
-        minus = problem.residuals(problem.retract(state, (-shared, local)))
-        difference = (plus - minus) / (2 * shared[k])
-        # Central differences: 1e-16 x residuals of 1 over steps of 1e-6.
-        torch.testing.assert_close(rows[:, 6 + k], difference, rtol=1e-6, atol=1e-6 * float(difference.abs().max()))

@@ -98,18 +98,6 @@ def test_a_much_damped_step_goes_downhill_by_what_it_predicts() -> None:
         assert float(fall / predicted) == pytest.approx(1.0, abs=0.2)
 
 
-def test_how_ranges_follow_the_cameras() -> None:
-    work, masks = adjustment(features(), landmarks=False)
-    problem, state = work.problem(masks), work.part(masks)
-    block = problem.blocks[0]
-    follow, own = problem.response(state, block)
-    rows = block.rows(problem.posed(state), state, problem.shared_size)
-    by_own, by_shared = rows[:, : block.size], rows[:, block.size : -1]
-    inverse = torch.linalg.inv(by_own @ by_own.mT)
-    torch.testing.assert_close(follow, -inverse @ (by_own @ by_shared.mT), rtol=1e-5, atol=1e-9)
-    torch.testing.assert_close(own, inverse, rtol=1e-6, atol=1e-14)
-
-
 def test_the_fall_without_an_item_is_that_of_a_new_solution() -> None:
     matches = features(12)
     matches.pixels[5, 1, 1] += 1.0

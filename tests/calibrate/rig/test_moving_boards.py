@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import datetime
 import functools
 import math
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from calibrate_scenes import observe
+from calibrate_scenes import calibration_record, observe
 from torch import Tensor
 
 from kcal import Board, Camera, InputError, Observations, RigOptions, calibrate_camera, calibrate_rig
@@ -23,7 +22,6 @@ from kcal.calibrate.rig.source import Context, PosedCamera, RigState, as_items
 from kcal.calibrate.rig.sources import Boards
 from kcal.calibrate.rig.unknowns import held
 from kcal.lens import CameraCalibration
-from kcal.lens.calibration import CalibrationRecord
 from kcal.lens.pose import Pose, rotation_from_vector, vector_from_rotation
 from kcal.rig import pair_by_name
 from kcal.sim.captures import BoardSize, sample_board_poses
@@ -38,6 +36,15 @@ SHIFT = torch.tensor([-0.25, 0.0, 0.0], dtype=F64)
 HANDS = Hands(turning=(0.4, 0.4), speed=(0.1, 0.1), readout=(0.02, 0.02), exposure=(0.005, 0.005))
 
 
+def observed(sides: list[Tensor]) -> tuple[Observations, Observations]:
+    """Of the left and the right camera, in pairs that show a dozen corners in both."""
+    seen = [torch.where((CAMERA.inside(own) & own.isfinite().all(-1))[..., None], own, torch.nan) for own in sides]
+    kept = (torch.stack(seen).isfinite().all(-1).sum(-1) >= 12).all(0).nonzero()[:, 0].tolist()
+    names = [f"{i:02d}" for i in kept]
+    left, right = (observe(own[kept], board=BOARD, size=CAMERA.size, names=names) for own in seen)
+    return left, right
+
+
 @functools.cache
 def captured(by_hand: bool, seed: int) -> tuple[Observations, Observations]:
     poses = sample_board_poses(CAMERA, SIZE, 10, torch.Generator().manual_seed(seed), fill=(0.25, 0.4))
@@ -47,12 +54,7 @@ def captured(by_hand: bool, seed: int) -> tuple[Observations, Observations]:
         moving_capture(CAMERA, own, sigma=0.1, seed=2 * seed + k, hands=hands, board=SIZE).pixels
         for k, own in enumerate((poses, right))
     ]
-    seen = [CAMERA.inside(pixels) & pixels.isfinite().all(-1) for pixels in sides]
-    kept = (torch.stack(seen).sum(-1) >= 12).all(0).nonzero()[:, 0].tolist()
-    names = [str(i) for i in kept]
-    corners = (torch.where(inside[..., None], own, torch.nan)[kept] for own, inside in zip(sides, seen, strict=True))
-    left_seen, right_seen = (observe(own, board=BOARD, size=CAMERA.size, names=names) for own in corners)
-    return left_seen, right_seen
+    return observed(sides)
 
 
 def solve(by_hand: bool, seed: int, camera: Camera = CAMERA, *, motion: bool = True) -> RigResult:
@@ -128,10 +130,7 @@ def test_what_is_told_of_motions_is_that_of_all_rows(shared: int) -> None:
     off = without_local(rows, 6)
     counts = float(views * (2 * corners - 6))
     whole = view_data(
-        Products.of_rows(off, 12),
-        torch.zeros(shared, dtype=F64),
-        torch.zeros(views, 12, dtype=F64),
-        counts,
+        Products.of_rows(off, 12), torch.zeros(shared, dtype=F64), torch.zeros(views, 12, dtype=F64), counts
     )
     length = off[:, 12:-1].transpose(0, 1).flatten(1).norm(dim=1)
     none = torch.full((shared,), -1)
@@ -205,11 +204,8 @@ def taken_apart(seed: int, turn: float, *, later: int = 0, bump: float = 0.0, sh
         for k, own in enumerate((poses, right))
     ]
     sides[1] = sides[1].roll(later, 0) + shift * torch.randn(len(poses), 1, 2, generator=random, dtype=F64)
-    seen = [torch.where((CAMERA.inside(own) & own.isfinite().all(-1))[..., None], own, torch.nan) for own in sides]
-    kept = (torch.stack(seen).isfinite().all(-1).sum(-1) >= 12).all(0).nonzero()[:, 0].tolist()
-    names = [f"{i:02d}" for i in kept]
-    views = [observe(own[kept], board=BOARD, size=CAMERA.size, names=names) for own in seen]
-    return calibrate_rig(CAMERA, CAMERA, *views, [(name, name) for name in names])
+    seen = observed(sides)
+    return calibrate_rig(CAMERA, CAMERA, *seen, [(name, name) for name in seen[0].names])
 
 
 @pytest.mark.parametrize("turn", [0.001, 0.005])
@@ -241,10 +237,7 @@ def test_images_that_a_stabilizer_shifts() -> None:
 
 
 def test_a_lens_whose_calibration_says_that_it_moves() -> None:
-    record = CalibrationRecord(
-        rms=0.1, views=1, points=9, per_view_rms={"a": 0.1}, board=BOARD.record, stop_reason="", iterations=1,
-        moves=(0.01, 5.0, 7.0), kcal_version="", created=datetime.datetime.now(datetime.UTC),
-    )  # fmt: skip
+    record = calibration_record(BOARD.record, moves=(0.01, 5.0, 7.0))
     cameras = [CAMERA.with_parameters(CAMERA.params.detach() + 1e-9 * c) for c in range(2)]
     for camera in cameras:
         known = 1e-6 * torch.eye(len(CAMERA.params), dtype=F64)

@@ -13,7 +13,18 @@ from calibrate_scenes import BOARD, SIZE, Motions, camera, motions, observe, pix
 from rig_scenes import CAMERAS, landmarks, tensor
 from torch import Tensor
 
-from kcal import Board, Camera, FileError, InputError, RigData, RigOptions, calibrate_rig, load_rig, solve_rig
+from kcal import (
+    Board,
+    Camera,
+    FileError,
+    InputError,
+    Observations,
+    RigData,
+    RigOptions,
+    calibrate_rig,
+    load_rig,
+    solve_rig,
+)
 from kcal.calibrate.problem.state import warp_modes
 from kcal.calibrate.rig.pairs import boards_of_several, pair_by_name, read_pairs
 from kcal.calibrate.rig.result import RigResult
@@ -58,12 +69,15 @@ def labels(count: int) -> list[str]:
     return [" ".join(pair) for pair in names(count)]
 
 
+def observed(pixels: Tensor, board: Board = BOARD) -> list[Observations]:
+    """Of the left and the right camera."""
+    return [observe(pixels[:, c], board=board, names=[pair[c] for pair in names(len(pixels))]) for c in (0, 1)]
+
+
 def solve(
     pixels: Tensor, *, left: Camera = LEFT, right: Camera = RIGHT, board: Board = BOARD, **options: Any
 ) -> RigResult:
-    pairs = names(len(pixels))
-    seen = [observe(pixels[:, c], board=board, names=[pair[c] for pair in pairs]) for c in (0, 1)]
-    return calibrate_rig(left, right, seen[0], seen[1], pairs, RigOptions(**options))
+    return calibrate_rig(left, right, *observed(pixels, board), names(len(pixels)), RigOptions(**options))
 
 
 def off(result: RigResult) -> tuple[float, float]:
@@ -74,7 +88,7 @@ def off(result: RigResult) -> tuple[float, float]:
 
 
 class TestTruth:
-    @pytest.mark.parametrize("count", [1, 2, 5])
+    @pytest.mark.parametrize("count", [1, 2, 3])
     def test_comes_back(self, count: int) -> None:
         result = solve(views(count, 1))
         assert result.status == SolverStatus.EXACT
@@ -84,13 +98,8 @@ class TestTruth:
         assert result.flipped == ()
         assert result.left_out == ()
         assert float(result.stereo().baseline) == pytest.approx(float(TRANSLATION.norm()), rel=1e-10)
-
-    def test_few_pairs_are_warned_of(self) -> None:
-        assert solve(views(3, 1)).warnings == ()
-        for count in (1, 2):
-            assert [text.split(":")[0] for text in solve(views(count, 1)).warnings] == [
-                f"{counted_text(count, 'pair')} only"
-            ]
+        told = [text.split(":")[0] for text in result.warnings]
+        assert told == ([f"{counted_text(count, 'pair')} only"] if count < 3 else [])
 
     def test_corners_that_one_camera_did_not_see(self) -> None:
         pixels = views(5, 1)
@@ -129,7 +138,9 @@ class TestTruth:
     @pytest.mark.slow
     def test_sigma_is_the_spread(self) -> None:
         """40 repetitions: 39 s² / σ² is χ²; s² / σ² lies in 0.332 to 2.17 but for 6e-5 (4 standard deviations)."""
-        results = [solve(views(4, 5, noise=0.2, noise_seed=seed)) for seed in range(40)]
+        # In which nothing moves and nothing is wrong.
+        plain = {"motion": False, "reject": False}
+        results = [solve(views(4, 5, noise=0.2, noise_seed=seed), **plain) for seed in range(40)]
         turns = torch.stack(
             [vector_from_rotation(result.stereo().right_from_left_rotation @ ROTATION.T) for result in results]
         )
@@ -202,8 +213,7 @@ class TestWeights:
             )
             pairs = names(4)
             seen = []
-            for c in (0, 1):
-                plain = observe(pixels[:, c], names=[pair[c] for pair in pairs])
+            for plain in observed(pixels):
                 spread = tuple((float(s) ** 2, 0.0, float(s) ** 2) for s in noise[:, 0])
                 known = tuple(view.model_copy(update={"covariance": spread}) for view in plain.views)
                 seen.append(plain.model_copy(update={"views": known}))
@@ -242,9 +252,9 @@ class TestWeights:
 class TestTurned:
     """Trap 8: a board read from its other end in some pairs."""
 
-    @pytest.mark.parametrize("board", [BOARD, AMBIGUOUS], ids=["7x6", "8x6"])
-    @pytest.mark.parametrize("side", [0, 1])
-    @pytest.mark.parametrize("count", [1, 2])
+    @pytest.mark.parametrize(
+        ("count", "side", "board"), [(1, 0, BOARD), (2, 1, BOARD), (1, 1, AMBIGUOUS), (2, 0, AMBIGUOUS)]
+    )
     def test_in_20_and_40_percent_of_pairs(self, count: int, side: int, board: Board) -> None:
         pixels = views(5, 7, board=board, noise=0.1)
         plain = solve(pixels, board=board)
@@ -263,8 +273,10 @@ class TestTurned:
             expected[which] = expected[which].flip(-2)
         assert torch.equal(result.pixels, expected)
 
-    def test_in_all_pairs(self) -> None:
+    def test_in_all_pairs_with_unseen_corners(self) -> None:
         pixels = views(5, 7, noise=0.1)
+        pixels[2, 1, :10] = torch.nan
+        pixels[4, 0, -12:] = torch.nan
         plain = solve(pixels)
         pixels[:, 1] = pixels[:, 1].flip(-2)
         result = solve(pixels)
@@ -280,16 +292,6 @@ class TestTurned:
             assert result.flipped == ()
             assert result.left_out == ()
             assert off(result)[1] < 0.01
-
-    def test_of_two_pairs_with_unseen_corners(self) -> None:
-        pixels = views(5, 7, noise=0.1)
-        pixels[2, 1, :10] = torch.nan
-        pixels[4, 0, -12:] = torch.nan
-        plain = solve(pixels)
-        pixels[[2, 4], 1] = pixels[[2, 4], 1].flip(-2)
-        result = solve(pixels)
-        assert result.flipped == (("l2 r2", "right"), ("l4 r4", "right"))
-        assert float(result.stereo().baseline) == pytest.approx(float(plain.stereo().baseline), rel=1e-6)
 
 
 class TestWrongPairs:
@@ -314,7 +316,7 @@ class TestWrongPairs:
         assert any(text.startswith("board l3 r3: ") and text.endswith("it was kept") for text in result.warnings)
         assert any("px is high" in text for text in result.warnings)
 
-    @pytest.mark.parametrize("shift", [(0.0, 4.0), (4.0, 0.0), (0.0, 8.0), (15.0, 0.0)])
+    @pytest.mark.parametrize("shift", [(0.0, 4.0), (15.0, 0.0)])
     def test_a_board_that_moved_between_the_exposures(self, shift: tuple[float, float]) -> None:
         """Left in, 4 px in one pair of eight turn the rig by 0.4 degrees."""
         pixels = views(8, 2, noise=0.1)
@@ -353,12 +355,10 @@ class TestWrongPairs:
 
 class TestRefusals:
     def test_swapped_cameras(self) -> None:
-        with pytest.raises(InputError, match="swapped"):
-            solve(views(5, 1, noise=0.1), left=RIGHT, right=LEFT)
-
-    def test_swapped_observations(self) -> None:
-        with pytest.raises(InputError, match="swapped"):
-            solve(views(5, 1, noise=0.1).flip(1))
+        pixels = views(5, 1, noise=0.1)
+        for seen, sides in ((pixels, (RIGHT, LEFT)), (pixels.flip(1), (LEFT, RIGHT))):
+            with pytest.raises(InputError, match="swapped"):
+                solve(seen, left=sides[0], right=sides[1])
 
     def test_nearly_equal_cameras_are_not_called_swapped_for_noise(self) -> None:
         pixels = views(5, 1, noise=0.3)
@@ -374,29 +374,18 @@ class TestRefusals:
         other = Camera.build(focal=(800, 800), center=(320, 240), size=SIZE)
         assert "if nothing moved, a camera is wrong" in solve(views(5, 1), right=other).warnings[0]
 
-    def test_boards(self) -> None:
-        pixels = views(3, 1)
-        one = observe(pixels[:, 0], names=["l0", "l1", "l2"])
-        other = observe(
-            pixels[:, 1], names=["r0", "r1", "r2"], board=Board(columns=7, rows=6, square=0.051)
-        )  # another square
-        with pytest.raises(InputError, match=r"the cameras saw different boards: .*50 mm.*51 mm"):
-            calibrate_rig(LEFT, RIGHT, one, other, names(3))
-
-    def test_image_sizes(self) -> None:
-        pixels = views(3, 1)
-        seen = [observe(pixels[:, c], names=[pair[c] for pair in names(3)]) for c in (0, 1)]
+    def test_views_that_do_not_belong_together(self) -> None:
+        left, right = observed(views(3, 1))
+        _, other = observed(views(3, 1), Board(columns=7, rows=6, square=0.051))
         half = Camera(RIGHT.params, size=(320, 240))
-        with pytest.raises(InputError, match="the right camera has images of 320x240, its observations of 640x480"):
-            calibrate_rig(LEFT, half, seen[0], seen[1], names(3))
-
-    def test_pairs(self) -> None:
-        pixels = views(3, 1)
-        seen = [observe(pixels[:, c], names=[pair[c] for pair in names(3)]) for c in (0, 1)]
-        with pytest.raises(InputError, match="no pair of views"):
-            calibrate_rig(LEFT, RIGHT, seen[0], seen[1], [])
-        with pytest.raises(InputError, match="no view named 'r7'"):
-            calibrate_rig(LEFT, RIGHT, seen[0], seen[1], [("l0", "r7")])
+        for taker, seen, pairs, told in (
+            (RIGHT, other, names(3), r"the cameras saw different boards: .*50 mm.*51 mm"),
+            (half, right, names(3), "the right camera has images of 320x240, its observations of 640x480"),
+            (RIGHT, right, [], "no pair of views"),
+            (RIGHT, right, [("l0", "r7")], "no view named 'r7'"),
+        ):
+            with pytest.raises(InputError, match=told):
+                calibrate_rig(LEFT, taker, left, seen, pairs)
 
     def test_too_few_corners(self) -> None:
         pixels = views(3, 1)
@@ -466,14 +455,12 @@ class TestPairsFile:
             "left,right\r\na.png,2.png\r\nb.png,1.png",
             "\ufeffleft,right\na.png,2.png\nb.png,1.png\n",
             "left , right\n\n a.png , 2.png\n\nb.png,1.png\n\n",
+            'left,right\n"a.png",2.png\nb.png,"1.png"',
         ],
-        ids=["plain", "Windows", "byte order mark", "blanks"],
+        ids=["plain", "Windows", "byte order mark", "blanks", "quotes"],
     )
     def test_reads(self, tmp_path: Path, content: str) -> None:
         assert self.read(tmp_path, content) == [("a.png", "2.png"), ("b.png", "1.png")]
-
-    def test_quoted_names(self, tmp_path: Path) -> None:
-        assert self.read(tmp_path, 'left,right\n"c, d.png",3.png\n') == [("c, d.png", "3.png")]
 
     @pytest.mark.parametrize(
         ("content", "error", "message"),
@@ -495,6 +482,7 @@ class TestPairsFile:
             ("left,right\na.png,1.png\na.png,2.png\n", InputError, "line 3: 'a.png' is paired twice"),
             ("left,right\na.png,1.png\nb.png,1.png\n", InputError, "line 3: '1.png' is paired twice"),
             (b"left,right\na\xff.png,1.png\n", FileError, "cannot read"),
+            ("left,right\n" + 200_000 * "a" + ",1.png\n", FileError, "cannot read: field larger"),
         ],
     )
     def test_refuses(self, tmp_path: Path, content: str | bytes, error: type[Exception], message: str) -> None:
@@ -503,17 +491,8 @@ class TestPairsFile:
         assert str(caught.value).startswith(str(tmp_path / "pairs.csv"))
         assert message in str(caught.value)
 
-    def test_no_file(self, tmp_path: Path) -> None:
-        with pytest.raises(FileError, match="cannot read"):
-            read_pairs(tmp_path / "none.csv", self.LEFT, self.RIGHT)
-        with pytest.raises(FileError, match="cannot read"):
-            read_pairs(tmp_path, self.LEFT, self.RIGHT)
-
-    def test_a_pipe_that_nobody_writes_to(self, tmp_path: Path) -> None:
-        os.mkfifo(tmp_path / "pipe.csv")
-        with pytest.raises(FileError, match="not a regular file"):
-            read_pairs(tmp_path / "pipe.csv", self.LEFT, self.RIGHT)
-
-    def test_a_field_beyond_all_measure(self, tmp_path: Path) -> None:
-        with pytest.raises(FileError, match="cannot read: field larger"):
-            self.read(tmp_path, "left,right\n" + 200_000 * "a" + ",1.png\n")
+    def test_what_is_no_file(self, tmp_path: Path) -> None:
+        os.mkfifo(tmp_path / "pipe.csv")  # to which nobody writes
+        for name, told in (("none.csv", "cannot read"), ("", "cannot read"), ("pipe.csv", "not a regular file")):
+            with pytest.raises(FileError, match=told):
+                read_pairs(tmp_path / name, self.LEFT, self.RIGHT)

@@ -20,7 +20,6 @@ from rig_scenes import (
     features,
     landmarks,
     normal,
-    see,
     spread_points,
     tensor,
 )
@@ -31,7 +30,6 @@ from kcal.calibrate.rig import initial_poses, solve
 from kcal.calibrate.rig import sources as board_limits
 from kcal.calibrate.rig.marks import Features, inverse_range_beyond
 from kcal.calibrate.rig.problem import RigProblem
-from kcal.calibrate.rig.resection import consensus_pose, poses_from_three
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import Context, PosedCamera, RigState, Start, as_items
@@ -176,25 +174,6 @@ class TestDerivatives:
         assert bool((rows[1, :, 84 + 42 + 3] == 0).all())
 
 
-class TestResection:
-    def test_three_points_give_the_pose_among_four(self) -> None:
-        points = spread_points(3, 100.0, 900.0, 1)
-        rays = (points - CENTER[0]) @ ROTATION[0].T
-        rotation, center = poses_from_three(rays / rays.norm(dim=-1, keepdim=True), points)
-        error = (center - CENTER[0]).norm(dim=-1).nan_to_num(math.inf)
-        best = int(error.argmin())
-        assert float(error[best]) < 1e-7
-        torch.testing.assert_close(rotation[best], ROTATION[0], rtol=0, atol=1e-9)
-
-    def test_a_minority_of_wrong_points_does_no_harm(self) -> None:
-        points = spread_points(9, 60.0, 900.0, 2)
-        rays = (points - CENTER[0]) @ ROTATION[0].T
-        rays = rays / rays.norm(dim=-1, keepdim=True)
-        points[[1, 4, 6]] += tensor([30.0, 0, 9], [0, -50, 20], [9, 9, -40])
-        found = consensus_pose(rays, points)
-        assert float((found[1] - CENTER[0]).norm()) < 1e-6
-
-
 SOURCES = {
     "landmarks": lambda n: {"landmarks": landmarks(cameras=n)},
     "boards": lambda n: {"boards": boards(cameras=n)},
@@ -249,6 +228,9 @@ class TestRecovery:
         found = solve_rig(data(count, **SOURCES[kind](count)), STRAIGHT)
         assert found.status in (SolverStatus.EXACT, SolverStatus.CONVERGED)
         assert found.left_out == ()
+        if kind == "all":
+            used = {source.name: source.used for source in found.sources}
+            assert used == {"boards": 6, "landmarks": 12, "features": 20, "baselines": 1, "positions": 1}
         if kind in ("features and positions", "boards and positions") and count == 2:
             # Two measured positions leave a turn about their line open; what the cameras are to each other is known.
             assert found.undetermined == ("a turn of the rig about its baseline",)
@@ -260,13 +242,6 @@ class TestRecovery:
             assert off(found) < (1e-9 if "positions" not in kind else 1e-5)
         assert bool(torch.isfinite(found.relative_covariance()).all())
 
-    def test_each_source_has_its_residuals(self) -> None:
-        found = solve_rig(data(**SOURCES["all"](2)))
-        assert [source.name for source in found.sources] == [
-            "boards", "landmarks", "features", "baselines", "positions",
-        ]  # fmt: skip
-        assert [source.used for source in found.sources] == [6, 12, 20, 1, 1]
-
     def test_noise_shows_as_it_is(self) -> None:
         sources = {"landmarks": landmarks(noise=0.1, error=0.02), "boards": boards(noise=0.08)}
         found = solve_rig(data(**sources, features=features(noise=0.1, known=0.1)))
@@ -274,15 +249,6 @@ class TestRecovery:
         assert [source.sigmas for source in found.sources] == pytest.approx([1.0, 1.0, 1.0], abs=0.25)
         assert found.variance == 1.0
         assert found.warnings == ()
-
-    def test_boards_read_from_the_other_end(self) -> None:
-        shown = boards(noise=0.05)
-        plain = solve_rig(data(boards=shown))
-        shown.pixels[2, 1] = shown.pixels[2, 1].flip(-2)
-        turned = solve_rig(data(boards=shown))
-        assert turned.flipped == (("pair 2", "right"),)
-        sigma = plain.relative_covariance().diagonal().sqrt()
-        assert bool(((pose_error(turned) - pose_error(plain)).abs() < 1e-4 * sigma).all())
 
     def test_a_baseline_sets_the_scale_of_far_features(self) -> None:
         found = solve_rig(data(features=features(count=40, noise=0.1, known=0.1), baselines=BASELINE))
@@ -295,10 +261,7 @@ class TestRecovery:
 
 class TestFrame:
     @settings(max_examples=6)
-    @given(
-        turn=st.tuples(*[st.floats(-3.0, 3.0)] * 3),
-        shift=st.tuples(*[st.floats(-5e4, 5e4)] * 3),
-    )
+    @given(turn=st.tuples(*[st.floats(-3.0, 3.0)] * 3), shift=st.tuples(*[st.floats(-5e4, 5e4)] * 3))
     def test_the_solution_moves_with_the_frame(self, turn: tuple, shift: tuple) -> None:
         """Landmarks turned and shifted as a whole, up to 50 km: cameras follow, relative pose and sigmas stay."""
         marks = landmarks(noise=0.1, error=0.02)
@@ -364,9 +327,7 @@ class TestIntrinsics:
             type(camera)(values, size=camera.size, model=camera.model)
             for camera, values in zip(CAMERAS, rough, strict=False)
         )
-        sources = data(
-            landmarks=landmarks(count=30, noise=0.1, error=0.02), boards=boards(noise=0.1)
-        )  # fmt: skip
+        sources = data(landmarks=landmarks(count=30, noise=0.1, error=0.02), boards=boards(noise=0.1))
         for camera in cameras:
             camera.calibration = CameraCalibration(covariance=torch.diag(spread**2))
         sources = dataclasses.replace(sources, cameras=cameras)
@@ -453,13 +414,6 @@ class TestCovariance:
         assert 100 - 4 * (2 * 100) ** 0.5 < total[0] < 120 + 4 * (2 * 120) ** 0.5
         assert 120 - 4 * (2 * 120) ** 0.5 < total[1] < 120 + 4 * (2 * 120) ** 0.5
 
-    def test_joint_covariance_has_the_order_of_the_rig(self) -> None:
-        found = solve_rig(data(landmarks=landmarks(noise=0.1)), RigOptions(intrinsics="fixed"))
-        joint = found.joint_covariance()
-        assert joint.shape == (26, 26)
-        assert bool((joint[:20] == 0).all())
-        torch.testing.assert_close(joint[20:, 20:], found.relative_covariance())
-
     def test_sigmas_that_are_too_small_widen_the_covariance(self) -> None:
         marks = landmarks(count=16, noise=0.1, error=0.02)
         honest = solve_rig(data(landmarks=marks))
@@ -473,9 +427,12 @@ class TestCovariance:
 class TestWrong:
     def test_a_wrong_landmark_is_named_and_left_out(self) -> None:
         marks = landmarks(noise=0.1, error=0.02)
-        good = solve_rig(data(landmarks=dataclasses.replace(marks, pixels=_without(marks.pixels, 4))))
+        fewer = dataclasses.replace(marks, pixels=_without(marks.pixels, 4))
+        good = solve_rig(data(landmarks=fewer, baselines=BASELINE))
         marks.points[4] += tensor(0.0, 0.0, 2.0)
-        found = solve_rig(data(landmarks=marks))
+        found = solve_rig(data(landmarks=marks, baselines=BASELINE))
+        # The baseline is not blamed for it.
+        assert found.contradictions == ()
         (wrong,) = found.left_out
         assert (wrong.source, wrong.name) == ("landmarks", "post 4")
         assert "off the surveyed place by" in wrong.reason
@@ -514,18 +471,6 @@ class TestWrong:
             without = solve_rig(rest, RigOptions(reject=False))
             assert float(falls[i]) == pytest.approx(whole.chi2 - without.chi2, rel=2e-2)
 
-    def test_good_ones_stay(self) -> None:
-        for seed in range(3):
-            kind = {"landmarks": landmarks(noise=0.1, error=0.02, seed=seed), "boards": boards(noise=0.1, seed=seed)}
-            assert solve_rig(data(**kind)).left_out == ()
-
-    def test_a_moment_that_was_none(self) -> None:
-        """The board moved between the exposures: one pixel in one camera."""
-        shown = boards(count=8, noise=0.05)
-        shown.pixels[5, 1] += tensor(1.0, 0.0)
-        found = solve_rig(data(boards=shown))
-        assert [item.name for item in found.left_out] == ["pair 5"]
-
     def test_lenses_that_are_not_quite_their_models_make_no_board_wrong(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """They bend some boards more than others, by much more than corners that are this good would ever be off."""
         shown = boards(count=8, noise=0.01)
@@ -560,6 +505,10 @@ class TestNotDetermined:
         ("sources", "message"),
         [
             ({"features": features(known=0.1)}, "nothing tells where right stands"),
+            (
+                {"features": features(noise=0.1, known=0.1), "positions": positions(1)},
+                "nothing tells where right stands",
+            ),
             ({"landmarks": landmarks(count=2)}, "nothing tells where right stands"),
             ({"boards": None}, "nothing to solve it from"),
         ],
@@ -581,11 +530,6 @@ class TestNotDetermined:
         assert len(found.undetermined) == 3
         assert any("the heading" in text for text in found.warnings)
         assert float(pose_error(found).abs().max()) < 1e-8
-
-    def test_one_mark_each_without_scale_is_refused(self) -> None:
-        far = features(count=30, noise=0.1, known=0.1)
-        with pytest.raises(DegenerateError, match="nothing tells where right stands"):
-            solve_rig(data(features=far, positions=positions(1)))
 
 
 class TestInput:
@@ -644,7 +588,3 @@ def _without(pixels: Tensor, index: int) -> Tensor:
     pixels = pixels.clone()
     pixels[index] = torch.nan
     return pixels
-
-
-def test_see_marks_what_is_outside() -> None:
-    assert bool(torch.isnan(see(CENTER[0][None] - 10.0 * ROTATION[0][2], 0)).all())
