@@ -102,13 +102,7 @@ RECORDS = {
     "View",
 }
 # They write a picture or page of a whole result, or need a video, raster or observations: see the tests of their rooms.
-WITHOUT_EXAMPLE = {
-    "ceres_prior",
-    "terrain",
-    "detect_video",
-    "paired_boards",
-    "save_map",
-}
+WITHOUT_EXAMPLE = {"ceres_prior", "terrain", "detect_video", "paired_boards", "save_map"}
 
 
 @pytest.mark.parametrize("door", PUBLIC)

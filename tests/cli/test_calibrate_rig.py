@@ -342,10 +342,7 @@ class TestRig:
             ),
             (f"none.json right.camera.json {PAIRS}", "none.json: cannot read"),
             (f"right.camera.json left.camera.json {PAIRS}", "left and right are exchanged"),
-            (
-                "left.camera.json right.camera.json --pairs right.obs.json left.obs.json",
-                "they are exchanged",
-            ),
+            ("left.camera.json right.camera.json --pairs right.obs.json left.obs.json", "they are exchanged"),
             (f"left.camera.json right.camera.json {PAIRS} --match none.csv", "none.csv: cannot read"),
             (f"left.camera.json left.camera.json {PAIRS}", "or these are views of two cameras"),
             ("left.camera.json left.camera.json --pairs left.obs.json left.obs.json", "camera twice"),

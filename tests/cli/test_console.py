@@ -79,14 +79,7 @@ def test_an_error_shows_the_name_of_a_file_as_it_is(
     assert again == shown == f"error: {visible(json.loads(told)['error'])}\n"
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        [ESCAPE],
-        ["bake", f"--{ESCAPE}"],
-        ["bake", "camera.json", ESCAPE],
-    ],
-)
+@pytest.mark.parametrize("arguments", [[ESCAPE], ["bake", f"--{ESCAPE}"], ["bake", "camera.json", ESCAPE]])
 def test_a_wrong_use_shows_what_was_typed(
     arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

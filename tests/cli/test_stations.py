@@ -319,15 +319,7 @@ def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: 
     # A distance that is known better than by boards moves the cameras to it, and only those two by all of it.
     far = float((centers[0] - centers[2]).norm()) * 1.01
     run(
-        tmp_path,
-        "rig",
-        *three,
-        *boards,
-        "--baseline",
-        f"mill:church={far:.5f}±0.00001",
-        "--keep-all",
-        "-o",
-        "rig.json",
+        tmp_path, "rig", *three, *boards, "--baseline", f"mill:church={far:.5f}±0.00001", "--keep-all", "-o", "rig.json"
     )
     held = load_rig(tmp_path / "rig.json")
     assert float((held.center[0] - held.center[2]).norm()) == pytest.approx(far, abs=1e-4)

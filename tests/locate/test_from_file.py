@@ -28,10 +28,7 @@ def test_the_same_intervals_as_the_command(tmp_path: Path, command: Command) -> 
     marks.write_text("\n".join(["left_u,left_v,right_u,right_v", *rows]) + "\n")
     out = tmp_path / "positions.csv"
     command("locate", SAMPLE, marks, "--pixel-sigma 0.1 -o", out)
-    for localize in (
-        Localizer(load_rig(SAMPLE), pixel_sigma=0.1),
-        Localizer.from_file(SAMPLE, pixel_sigma=0.1),
-    ):
+    for localize in (Localizer(load_rig(SAMPLE), pixel_sigma=0.1), Localizer.from_file(SAMPLE, pixel_sigma=0.1)):
         assert localize.included == ("marks", "calibration", "mounting")
         found = localize(LEFT, RIGHT)
         for i, row in enumerate(csv.DictReader(out.open())):
