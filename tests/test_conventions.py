@@ -31,14 +31,7 @@ NAMED = sorted(set(re.findall(r"`([\w/]+\.py(?:::\w+)*)`", PAGE)))
 
 def test_board_points() -> None:
     points = Board(columns=3, rows=2, square=0.5).points
-    assert points.tolist() == [
-        [0.0, 0.0, 0.0],
-        [0.5, 0.0, 0.0],
-        [1.0, 0.0, 0.0],
-        [0.0, 0.5, 0.0],
-        [0.5, 0.5, 0.0],
-        [1.0, 0.5, 0.0],
-    ]
+    assert points.tolist() == [[x, y, 0.0] for y in (0.0, 0.5) for x in (0.0, 0.5, 1.0)]
     assert points.dtype == torch.float64
 
 

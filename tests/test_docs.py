@@ -16,7 +16,10 @@ from scripts.docs_site import commands_page, conclusions_page, navigation, order
 from scripts.make_reference import DOORS, groups, page, page_of, public
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    *(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "SECURITY")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 
 
@@ -89,18 +92,13 @@ def test_a_page_names_what_exists(page: Path) -> None:
 def test_planted_mistakes_are_seen() -> None:
     page = ROOT / "docs" / "index.md"
     assert missing_links(page, "[a](none.md) ![b](none.png) [c](#d) [e](https://f.org/none)") == ["none.md", "none.png"]
-    assert missing_scripts("`scripts/none.py`, python -m scripts.bench.none") == [
-        "scripts.bench.none",
-        "scripts/none.py",
-    ]
+    scripts = missing_scripts("`scripts/none.py`, python -m scripts.bench.none")
+    assert scripts == ["scripts.bench.none", "scripts/none.py"]
     text = "`kcal/none.py` `kcal/lens/camera.py::Camera.none` `kcal/lens/camera.py::Camera.project`"
     assert missing_code(text) == ["kcal/none.py", "kcal/lens/camera.py::Camera.none"]
     there = "`kcal.lens.bake(camera)`, kcal.Camera.project, kcal.lens.zernike, kcal/none.py, a.kcal.none"
-    assert missing_names(f"{there}: kcal.bake kcal.lens.none kcal.none.Camera") == [
-        "kcal.bake",
-        "kcal.lens.none",
-        "kcal.none.Camera",
-    ]
+    absent = ["kcal.bake", "kcal.lens.none", "kcal.none.Camera"]
+    assert missing_names(f"{there}: {' '.join(absent)}") == absent
 
 
 def names_in(nav: object) -> list[str]:
@@ -122,12 +120,8 @@ def test_every_page_is_in_the_navigation() -> None:
 
 
 def test_pages_without_a_place_follow_those_that_have_one() -> None:
-    assert ordered(["new", "drift", "board", "marking"], ("board", "mark*", "drift")) == [
-        "board",
-        "marking",
-        "drift",
-        "new",
-    ]
+    found = ordered(["new", "drift", "board", "marking"], ("board", "mark*", "drift"))
+    assert found == ["board", "marking", "drift", "new"]
 
 
 @pytest.mark.parametrize("door", DOORS)

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
+from calibrate_scenes import motions, observe, pixels_of
 from typer.main import get_command
 
-from kcal import Board, Camera, Observations, View, load_rig, save_camera
+from kcal import Camera, Observations, load_rig, save_camera
 from kcal.cli.main import app
 from kcal.cli.options import SETTINGS, defaults_of
-from kcal.lens.pose import rotation_from_vector
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -65,18 +64,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _observations(seed: str) -> Observations:
-    board = Board(columns=7, rows=6, square=0.05)
+def _observations(side: str) -> Observations:
     camera = Camera.build(focal=(800, 800), center=(322, 238), size=(640, 480), coefficients=[-0.1, 0.02])
-    tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 1.5], [0, 0.5, 0.2], [0.1, -0.5, 0], [0.4, 0.4, -1.4]]).double()
-    noise = torch.Generator().manual_seed(len(seed))
-    views = []
-    for number, rotation in enumerate(rotation_from_vector(tilts)):
-        points = (board.points - board.points.mean(0)) @ rotation.T + torch.tensor([0.0, 0.0, 0.7]).double()
-        pixels = camera.project(points)[0]
-        pixels = pixels + 0.05 * torch.randn(pixels.shape, generator=noise, dtype=torch.float64)
-        views.append(View(name=str(number), pixels=pixels.tolist()))
-    return Observations(board=board, image_size=(640, 480), views=views)
+    return observe(pixels_of(camera, motions(camera, 5, 4), noise=0.05, seed=len(side)), names="01234")
 
 
 @pytest.mark.slow

@@ -57,8 +57,6 @@ def test_sizes_of_files_of_other_programs(options: dict[str, object]) -> None:
     data = io.BytesIO()
     Image.fromarray(LEVELS).save(data, **options)  # type: ignore[arg-type]
     assert size_of(data.getvalue()) == (53, 37)
-    swapped = cv2.imencode(".tif", LEVELS)[1].tobytes()
-    assert swapped[:2] == b"II"
 
 
 def test_a_jpeg_with_a_thumbnail_and_comments() -> None:
@@ -117,15 +115,6 @@ def test_decoders_that_cameras_do_not_need_are_not_reached(data: bytes) -> None:
         check_image_header(data + bytes(100), "x")
 
 
-def test_a_png_has_no_more_pixels_than_its_bytes_can_have() -> None:
-    """One damaged byte of its size: 320 megapixels of 79 bytes were decoded for 12 s."""
-    data = bytearray(cv2.imencode(".png", np.eye(40, dtype=np.uint8))[1].tobytes())
-    check_image_header(bytes(data), "x")
-    data[17] = 0x7A
-    with pytest.raises(FileError, match="x: the image is truncated or corrupt"):
-        check_image_header(bytes(data), "x")
-
-
 # Sizes in headers written by hand: byte orders, kinds of numbers and origins that encoders here do not write.
 
 
@@ -133,25 +122,17 @@ def tiff(order: str, big: bool, entries: list[tuple[int, int, int]], pad: int = 
     """A TIFF with one directory after `pad` bytes: entries of tag, kind and value."""
     letters = {3: "H", 4: "I", 16: "Q"}
     mark = b"II" if order == "<" else b"MM"
-    size = 8 if big else 4
-    if big:
-        data = (
-            mark + struct.pack(f"{order}HHHQ", 43, 8, 0, 16 + pad) + bytes(pad) + struct.pack(f"{order}Q", len(entries))
-        )
-    else:
-        data = mark + struct.pack(f"{order}HI", 42, 8 + pad) + bytes(pad) + struct.pack(f"{order}H", len(entries))
+    size, wide, short = (8, "Q", "Q") if big else (4, "I", "H")
+    begin = struct.pack(f"{order}HHHQ", 43, 8, 0, 16 + pad) if big else struct.pack(f"{order}HI", 42, 8 + pad)
+    data = mark + begin + bytes(pad) + struct.pack(f"{order}{short}", len(entries))
     for tag, kind, value in entries:
-        count = struct.pack(f"{order}Q" if big else f"{order}I", 1)
-        data += struct.pack(f"{order}HH", tag, kind) + count
+        data += struct.pack(f"{order}HH{wide}", tag, kind, 1)
         data += (struct.pack(f"{order}{letters[kind]}", value) if kind in letters else b"").ljust(size, b"\0")
     return data
 
 
 def jpeg2000(right: int, bottom: int, left: int, top: int) -> bytes:
     return b"\xff\x4f\xff\x51" + struct.pack(">HHIIII", 47, 0, right, bottom, left, top) + bytes(30)
-
-
-SIZE = (53, 37)
 
 
 @pytest.mark.parametrize(
@@ -173,40 +154,28 @@ SIZE = (53, 37)
     ],
 )
 def test_sizes(data: bytes) -> None:
-    read = next(read for start, read in _FORMATS.items() if data.startswith(start))
-    assert read(data) == SIZE
+    assert size_of(data) == (53, 37)
     check_image_header(data, "x")
     assert is_image(data)
 
 
 def test_what_has_no_size_is_truncated() -> None:
-    for data in (
-        tiff("<", False, [(256, 3, 53), (257, 3, 37)])[:-12],
-        b"P5 53",
-        b"\xff\xd8\xff\xda",
-        jpeg2000(1, 1, 0, 0)[:20],
-    ):
+    short = tiff("<", False, [(256, 3, 53), (257, 3, 37)])[:-12]
+    for data in (short, b"P5 53", b"\xff\xd8\xff\xda", jpeg2000(1, 1, 0, 0)[:20]):
         with pytest.raises(FileError, match="x: the image is truncated or corrupt"):
             check_image_header(data, "x")
 
 
 def test_words_are_no_images() -> None:
-    for data in (
-        b"BMW is a car, and much more than thirty letters",
-        b"P5 is a title",
-        b"BM" + bytes(40),
-        b"GIF89a",
-        b"",
-    ):
-        assert not is_image(data)
-    assert not is_image(b"P5 0 5 255 ")
-    assert not is_image(b"P5 1048576 5 255 ")
-    assert is_image(b"P5 1048575 1 255 ")
+    words = b"BMW is a car, and much more than thirty letters", b"P5 is a title", b"BM" + bytes(40), b"GIF89a", b""
+    assert not any(map(is_image, (*words, b"P5 0 5 255 ", b"P5 1048576 5 255 ")))
     # A cut picture is a picture.
-    assert is_image(b"\xff\xd8")
+    assert all(map(is_image, (b"P5 1048575 1 255 ", b"\xff\xd8")))
 
 
 def test_a_png_of_more_pixels_than_its_bytes_can_have() -> None:
+    """One damaged byte of its size: 320 megapixels of 79 bytes were decoded for 12 s."""
+
     def png(width: int, height: int, size: int) -> bytes:
         return (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">II", width, height)).ljust(size, b"\0")
 

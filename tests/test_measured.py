@@ -140,13 +140,8 @@ def extra_packages() -> frozenset[str]:
             for extra in line[5:].rstrip("]").split(","):
                 waiting += project["optional-dependencies"][extra]
         names.add(re.split(r"[^\w.-]", line)[0].lower())
-    other = {
-        "cv2": "opencv-contrib-python-headless",
-        "PIL": "pillow",
-        "skimage": "scikit-image",
-        "erfa": "pyerfa",
-        "yaml": "pyyaml",
-    }
+    other = {"cv2": "opencv-contrib-python-headless", "PIL": "pillow", "skimage": "scikit-image"}
+    other |= {"erfa": "pyerfa", "yaml": "pyyaml"}
     return frozenset({*names, *(name for name, package in other.items() if package in names)})
 
 

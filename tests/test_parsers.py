@@ -63,20 +63,6 @@ def test_numbers_that_are_none(kind: str) -> None:
     assert np.array_equal(found, [[np.nan, np.inf, -np.inf]], equal_nan=True)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "%YAML:1.0\na: 1\na: 2\n", "%YAML:1.0\na: [1, 2\n", "%YAML:1.0\na: [1] 2\n",
-        "%YAML:1.0\na: 1\n  b: 2\n", "%YAML:1.0\nnothing\n", '%YAML:1.0\na: "b\n', "- 1\n", "<a/>", '{"a": 1, "a": 2}',
-        "%YAML:1.0\nK: !!opencv-matrix\n  rows: 2\n  cols: 2\n  dt: d\n  data: [ 1., 2., 3. ]\n",
-        "%YAML:1.0\nK: !!opencv-matrix\n  rows: 1\n  cols: 2\n  dt: d\n  data: [ 1., x ]\n",
-    ],
-)  # fmt: skip
-def test_what_is_refused(text: str) -> None:
-    with pytest.raises(FileError, match=r"^x: "):
-        read_storage(text.encode(), "x")
-
-
 @pytest.mark.parametrize("packed", [False, True])
 def test_what_matlab_and_scipy_write(packed: bool) -> None:
     numbers = {f"n{kind}": np.arange(12).reshape(2, 3, 2).astype(kind) for kind in ("f8", "f4", "i1", "u2", "i8")}

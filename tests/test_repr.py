@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 import torch
+from calibrate_scenes import motions, observe, pixels_of
 from locate_rigs import located_pairs
 
 import kcal
 from kcal import Board, Camera, Localizer, Observations, Origin, Rig, View
 from kcal.corners.detect import Detection
-from kcal.lens import rotation_from_vector
 from kcal.rig import RigCovariance
 
 ROOT = Path(__file__).parents[1]
@@ -26,19 +26,7 @@ RIG = Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
 
 
 def calibrated() -> Any:
-    board = Board(columns=7, rows=6, square=0.05)
-    tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 1.5], [0, 0.5, 0.2], [0.1, -0.5, 0], [0.4, 0.4, -1.4]]).double()
-    noise = torch.Generator().manual_seed(4)
-    views = []
-    for number, turn in enumerate(rotation_from_vector(tilts)):
-        points = (board.points - board.points.mean(0)) @ turn.T + torch.tensor([0, 0, 0.7]).double()
-        pixels = CAMERA.project(points)[0]
-        views.append(
-            View(
-                name=str(number), pixels=pixels + 0.05 * torch.randn(pixels.shape, generator=noise, dtype=pixels.dtype)
-            )
-        )
-    seen = Observations(board=board, image_size=(1920, 1080), views=views)
+    seen = observe(pixels_of(CAMERA, motions(CAMERA, 5, 4), noise=0.05), size=CAMERA.size, names="01234")
     return kcal.calibrate_camera(seen, kcal.CalibrationOptions(model="opencv5"))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import re
@@ -16,6 +15,7 @@ from typing import Any
 import pytest
 import torch
 from browser import chromium_page, needs_browser
+from command_line import rows_of
 from track_scenes import ORIGIN, seen_by, tracked_site
 from waiting import PATIENCE
 
@@ -38,11 +38,6 @@ def zoom_and_click(page: Any, side: str, place: Any) -> None:
         page.mouse.wheel(0, -240)
         page.wait_for_function("([side, before]) => kcal.views[side].scale > before", arg=[side, before])
     click_at(page, side, *place)
-
-
-def rows_of(path: Path) -> dict[str, dict[str, str]]:
-    with path.open(encoding="utf-8") as file:
-        return {row["name"]: row for row in csv.DictReader(file)}
 
 
 def test_a_site_is_marked_by_clicks(tmp_path: Path) -> None:
@@ -70,7 +65,8 @@ def test_a_site_is_marked_by_clicks(tmp_path: Path) -> None:
         settled(page)
         assert page.complaints == []
         # What was clicked is what is on the disk.
-        marks, points = rows_of(tmp_path / "marks.csv"), rows_of(tmp_path / "marks.points.csv")
+        files = tmp_path / "marks.csv", tmp_path / "marks.points.csv"
+        marks, points = ({row["name"]: row for row in rows_of(path)} for path in files)
         assert (set(marks), set(points)) == ({"post 1", "post 5"}, {"gate"})
         for name, row in (*marks.items(), *points.items()):
             for side, place in zip(("left", "right"), site.pixels[name], strict=True):
@@ -78,7 +74,7 @@ def test_a_site_is_marked_by_clicks(tmp_path: Path) -> None:
                 assert clicked == pytest.approx(place, abs=0.6), (name, side)
         page.get_by_role("button", name="Undo").click()
         page.wait_for_function("() => !kcal.item().right")
-        assert rows_of(tmp_path / "marks.points.csv") == {}
+        assert rows_of(files[1]) == []
         # The page knows all of it when it is opened again.
         page.reload()
         settled(page)
@@ -138,6 +134,5 @@ def test_targets_are_watched_until_the_stream_ends(tmp_path: Path) -> None:
             assert page.complaints == []
         assert process.wait(timeout=PATIENCE) == 0
     assert [text.split(",")[0] for text in shown] == ["left camera", "right camera", "track 1", "track 2"]
-    with (tmp_path / "tracks.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "tracks.csv")
     assert (rows[-1]["sequence"], {row["name"] for row in rows}) == ("20", {"track 1", "track 2"})

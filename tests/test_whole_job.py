@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import cv2
 import pytest
 import torch
 from board_render import render
+from command_line import rows_of
 from locate_rigs import located_pairs
 from torch import Tensor
 
@@ -101,7 +101,7 @@ def test_from_images_to_positions(images: Path, tmp_path: Path) -> None:
     for name in ("positions.csv", "positions.geojson", "positions.kml", "positions.cot"):
         kcal.locate.write_positions(tmp_path / name, located)
     kcal.report.save_map(tmp_path / "map.html", located, truth)
-    rows = list(csv.DictReader((tmp_path / "positions.csv").open()))
+    rows = rows_of(tmp_path / "positions.csv")
     assert [row["name"] for row in rows] == ["gate", "mast"]
     features = json.loads((tmp_path / "positions.geojson").read_text())["features"]
     place = kcal.locate.enu_to_geodetic(truth[:1], ORIGIN)[0].tolist()

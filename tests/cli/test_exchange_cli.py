@@ -7,21 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from typer.testing import CliRunner
+from command_line import invoked as run
 
 from kcal import Camera, InputError, Observations, Rig, load_camera, load_rig, save_camera, save_rig
-from kcal.cli.main import app
 from kcal.cli.rig import _exact_line
 from kcal.lens import CameraCalibration
 from kcal.locate.survey import read_survey
-
-
-def run(*words: object) -> str:
-    done = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=True)
-    if done.exception is not None and not isinstance(done.exception, SystemExit):
-        raise done.exception
-    assert done.exit_code == 0, done.output
-    return done.output
 
 
 @pytest.fixture

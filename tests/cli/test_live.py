@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import itertools
 import json
 import os
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_line import at_moment
+from command_line import at_moment, rows_of
 from track_scenes import ORIGIN, seen_by, tracked_site
 from typer.testing import CliRunner
 
@@ -59,8 +58,7 @@ def test_the_whole_job(folder: Path) -> None:
     offset = float(told.split("images are ")[1].split(" ")[0])
     sigma = float(told.split("± ")[1].split(" ")[0])
     assert abs(offset - 50.0) < 3 * sigma < 20.0
-    with open(folder / "tracks.csv", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(folder / "tracks.csv")
     assert len(rows) == 34
     assert {row["name"] for row in rows} == {"track 1", "track 2"}
     assert float(rows[-2]["north_m"]) == pytest.approx(150.0, rel=0.02)
@@ -208,8 +206,7 @@ def test_stations_into_files(tmp_path: Path) -> None:
     assert done.exit_code == 0
     assert "with names of tower 1, tower 2, tower 3" in done.output
     assert "tower 3's images are" in done.output
-    with open(tmp_path / "tracks.csv", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "tracks.csv")
     assert {row["name"] for row in rows} == {"track 1", "track 2"}
     assert {row["cameras"] for row in rows if row["sequence"] == "9"} == {"tower 2 tower 3"}
     assert {row["told_from"] for row in rows} == {"tower 1"}
@@ -240,7 +237,6 @@ def test_placed_cameras_may_be_named_left_and_right(tmp_path: Path) -> None:
     command = ["live", str(tmp_path / "towers.json"), "--detections", str(tmp_path / "lines.jsonl")]
     done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "tracks.csv")], catch_exceptions=False)
     assert done.exit_code == 0, done.output
-    with open(tmp_path / "tracks.csv", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "tracks.csv")
     assert rows
     assert float(rows[-1]["east_m"]) == pytest.approx(300.0, abs=15.0)

@@ -1,12 +1,11 @@
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
 import pytest
 import torch
-from command_line import Command
+from command_line import Command, rows_of
 
 from kcal.io.camera_file import provenance, save_camera
 from kcal.io.rig_file import load_rig, save_rig
@@ -42,8 +41,7 @@ def test_writes_files_and_a_table(folder: Path, command: Command, origin: str) -
     assert "errors in calibration and mounting are not included" in printed
     features = json.loads((folder / "out.geojson").read_text())["features"]
     assert [feature["properties"]["name"] for feature in features[2:]] == ["[b]mast", "lost", "[b]mast"]
-    with (folder / "out.csv").open() as file:
-        assert [row["status"] for row in csv.DictReader(file)] == ["ok", "outside_image"]
+    assert [row["status"] for row in rows_of("out.csv")] == ["ok", "outside_image"]
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -52,8 +50,7 @@ def test_a_rig_without_a_place_gives_meters_in_its_own_frame(folder: Path, comma
     row = next(line for line in shown.splitlines() if line.startswith("[b]mast")).split()
     assert [float(cell) for cell in row[1:5]] == pytest.approx([10.0, 0.0, 1000.0, 1000.0], abs=0.06)
     assert "no place on the Earth: positions are meters, x right," in " ".join(shown.split())
-    with (folder / "out.csv").open() as file:
-        mast, lost = csv.DictReader(file)
+    mast, lost = rows_of("out.csv")
     assert mast["frame"] == "x right, y down, z forward of the left camera"
     assert [float(mast[name]) for name in ("x_m", "y_m", "z_m")] == pytest.approx([10.0, 0.0, 1000.0], abs=1e-6)
     assert float(mast["cov_zz_m2"]) > 100 * float(mast["cov_xx_m2"]) > 0
@@ -88,11 +85,11 @@ def test_what_is_doubted_of_a_rig_travels_with_it(folder: Path, command: Command
 def test_options_for_errors_grids_and_formats(folder: Path, command: Command) -> None:
     arguments = "rig.json points.csv --site 19.07,72.87,14 --heading 0.0 -o out.csv"
     command("locate", arguments, "--pixel-sigma 0.1 --refraction 0")
-    plain = next(iter(csv.DictReader((folder / "out.csv").open())))
+    plain = rows_of("out.csv")[0]
     more = "--grid EPSG:32643 --yaw-sigma 0.05 --heading 0±0.1 --refraction 0.13"
     outputs = "-o out.kml -o out.cot"
     printed = command("locate", arguments, "--pixel-sigma 0.1", more, outputs).out
-    row = next(iter(csv.DictReader((folder / "out.csv").open())))
+    row = rows_of("out.csv")[0]
     # Grid north of Mumbai's UTM zone is 0.70 degrees west of true north; the mark lies 0.57 degrees to the right.
     assert float(row["azimuth_deg"]) == pytest.approx(float(plain["azimuth_deg"]) - 0.6962 + 360, abs=1e-3)
     # 87 m for 0.05 degrees at 1 km.

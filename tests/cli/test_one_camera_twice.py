@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import pytest
 import torch
-from command_line import Command
+from command_line import Command, rows_of
 from rig_scenes import CAMERAS, CENTER, ROTATION, normal, spread_points
 from torch import Tensor
 
@@ -62,8 +61,7 @@ def test_a_file_given_twice_is_one_camera_at_two_places(folder: Path, command: C
     assert torch.equal(rig.left.params, rig.right.params)
     assert float(rig.baseline) == pytest.approx(float((CENTER[0] - CENTER[1]).norm()), abs=0.05)
     command("locate rig.json target.csv --pixel-sigma 0.1 -o out.csv")
-    with (folder / "out.csv").open() as file:
-        (row,) = csv.DictReader(file)
+    (row,) = rows_of(folder / "out.csv")
     assert row["status"] == "ok"
     low, high = float(row["range_low_m"]), float(row["range_high_m"])
     assert low < float((TARGET - CENTER[0]).norm()) < high < 1.2 * low

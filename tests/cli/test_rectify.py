@@ -177,12 +177,7 @@ def test_rig(folder: Path, command: Command) -> None:
     ],
 )
 def test_sides_of_a_rig(
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    command: Command,
-    place: tuple[float, float, float],
-    line: str,
-    warned: str,
+    folder: Path, monkeypatch: pytest.MonkeyPatch, command: Command, place: tuple[float, ...], line: str, warned: str
 ) -> None:
     """Maps without images; what a disparity is, is said; the rig that is written rectifies to itself."""
     monkeypatch.setenv("COLUMNS", "300")

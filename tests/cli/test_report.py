@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import os
@@ -14,11 +13,12 @@ from typing import Any
 import pytest
 import torch
 from browser import chromium_page, needs_browser
-from calibrate_scenes import BOARD, camera, motions
+from calibrate_scenes import camera, motions, observe, pixels_of
+from command_line import invoked, rows_of
 from locate_rigs import pinhole_rig
 from typer.testing import CliRunner
 
-from kcal import InputError, KcalError, Observations, View, save_rig
+from kcal import InputError, save_rig
 from kcal.cli.main import app
 from kcal.rig import RigCovariance
 from scripts.shared.station_scenes import ring
@@ -36,11 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Observations of an opencv5 camera, and that camera calibrated."""
     here = tmp_path_factory.mktemp("report")
     truth = camera("opencv5")
-    rotation, translation = motions(truth, 14, 3)
-    pixels, _ = truth.project(BOARD.points @ rotation.transpose(-1, -2) + translation[:, None])
-    pixels = pixels + 0.05 * torch.randn(pixels.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    views = [View(name=f"{i:02}", pixels=[tuple(p) for p in view]) for i, view in enumerate(pixels.tolist())]
-    Observations(board=BOARD, image_size=(640, 480), views=tuple(views)).save(here / "left.obs.json")
+    observe(pixels_of(truth, motions(truth, 14, 3), noise=0.05)).save(here / "left.obs.json")
     words = ("calibrate", here / "left.obs.json", "-o", here / "left.camera.json", "--model", "opencv5")
     code, text = kcal(*words, "--temperature", 21.5)
     assert code == 0
@@ -79,13 +75,6 @@ def test_calibration_ends_with_3_where_what_is_required_is_not_met(folder: Path)
     assert (folder / "again.json").exists()
     code, _ = kcal(*words, "--require", "200m")
     assert code == 1
-
-
-def test_a_file_that_nests_too_deeply_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "deep.json").write_text('{"kcal": "rig", "a": ' + "[" * 100_000 + "]" * 100_000 + "}")
-    found = CliRunner().invoke(app, ["report", str(tmp_path / "deep.json")])
-    assert found.exit_code == 1
-    assert isinstance(found.exception, KcalError | SystemExit)
 
 
 def test_a_rig_is_judged_by_its_covariance(tmp_path: Path) -> None:
@@ -186,10 +175,7 @@ def run(site_folder: Path, *words: str) -> str:
     given = [
         str(site_folder / word) if Path(word).suffix in (".csv", ".asc", ".png", ".json") else word for word in words
     ]
-    result = CliRunner().invoke(app, ["sites", *given, "--cells", "40"])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.output
+    return invoked("sites", *given, "--cells", "40")
 
 
 def test_the_site_on_the_ridge_is_better(site_folder: Path) -> None:
@@ -198,8 +184,7 @@ def test_the_site_on_the_ridge_is_better(site_folder: Path) -> None:
     assert [(one["name"], one["order"]) for one in told["candidates"]] == [("ridge", 1), ("west", None)]
     assert told["candidates"][0]["mean_sigma_after_m"] < told["mean_sigma_m"]
     assert (site_folder / "sites.png").stat().st_size > 10_000
-    with (site_folder / "map.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(site_folder / "map.csv")
     behind = [row for row in rows if float(row["lon"]) > 6.01]
     assert {row["seen_by"] for row in behind} == {"0"}
     assert {row["seen_by_after"] for row in behind} == {"1"}

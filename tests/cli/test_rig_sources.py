@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 import torch
-from command_line import Command
+from command_line import Command, rows_of
 from torch import Tensor
 from typer.testing import CliRunner
 
@@ -144,7 +143,7 @@ def test_from_survey_to_positions(site: Path, command: Command) -> None:
 
 @pytest.mark.slow
 def test_landmarks_from_geojson_and_a_requirement(site: Path, command: Command) -> None:
-    rows = list(csv.DictReader((site / "survey.csv").open()))
+    rows = rows_of(site / "survey.csv")
     features = [
         {
             "type": "Feature",

@@ -136,11 +136,6 @@ class TestSources:
         assert found.notes == ["a note of the stars"]
         assert (found.data.landmarks is not None) is landmarks
 
-    def test_landmarks_and_marks_belong_together(self) -> None:
-        for some in (Sources(landmarks=Path("a")), Sources(marks=Path("a"))):
-            with pytest.raises(InputError, match="belong together"):
-                read_sources(CAMERAS, some)
-
     def test_names_of_places(self) -> None:
         """A file given several times is one camera at several places."""
         paths = [Path(f"{name}.camera.json") for name in ("mill", "mast", "mill")]

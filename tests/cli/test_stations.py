@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 from collections.abc import Callable
@@ -11,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from click.testing import Result
-from command_line import Command
+from command_line import Command, invoked, rows_of
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
@@ -62,10 +61,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(folder: Path, *words: str) -> str:
-    result = CliRunner().invoke(app, [str(folder / word) if word.endswith(FILES) else word for word in words])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.output
+    return invoked(*(folder / word if word.endswith(FILES) else word for word in words))
 
 
 def solve(folder: Path) -> None:
@@ -85,8 +81,7 @@ def test_four_cameras_are_solved_and_locate_what_some_of_them_saw(folder: Path) 
     assert (enu_to_geodetic(rig.center, rig.origin) - there)[:, :2].abs().max() < 4e-5  # 4 m
     text = run(folder, "locate", "rig.json", "smoke.csv", "-o", "out.csv", "-o", "out.geojson", "--picture", "plan.png")
     assert "the mark in church contradicts the others" in text
-    with (folder / "out.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(folder / "out.csv")
     assert [row["status"] for row in rows] == ["ok", "ok", "ok", "bearing_only"]
     assert rows[1]["left_out"] == "church"
     assert rows[1]["cameras"] == "mill mast hill"
@@ -100,8 +95,7 @@ def test_four_cameras_are_solved_and_locate_what_some_of_them_saw(folder: Path) 
     assert (folder / "plan.png").stat().st_size > 10_000
     height = float(enu_to_geodetic(SMOKE[3], ORIGIN)[2])
     run(folder, "locate", "rig.json", "smoke.csv", "--height", f"{height:.1f}±3", "-o", "out.csv")
-    with (folder / "out.csv").open() as file:
-        last = list(csv.DictReader(file))[3]
+    last = rows_of(folder / "out.csv")[3]
     assert last["status"] == "ok"
     assert abs(float(last["lat"]) - float(enu_to_geodetic(SMOKE[3], ORIGIN)[0])) < 2e-3
 
@@ -319,15 +313,7 @@ def test_boards_seen_by_any_two_of_three_and_distances_of_named_pairs(tmp_path: 
     # A distance that is known better than by boards moves the cameras to it, and only those two by all of it.
     far = float((centers[0] - centers[2]).norm()) * 1.01
     run(
-        tmp_path,
-        "rig",
-        *three,
-        *boards,
-        "--baseline",
-        f"mill:church={far:.5f}±0.00001",
-        "--keep-all",
-        "-o",
-        "rig.json",
+        tmp_path, "rig", *three, *boards, "--baseline", f"mill:church={far:.5f}±0.00001", "--keep-all", "-o", "rig.json"
     )
     held = load_rig(tmp_path / "rig.json")
     assert float((held.center[0] - held.center[2]).norm()) == pytest.approx(far, abs=1e-4)
@@ -426,7 +412,7 @@ def test_one_pixel_and_two_are_located(names: tuple[str, str], known: Path, comm
     )
     for table in ("wide.csv", "long.csv"):
         command(f"locate rig.json {table} -o found.csv")
-        found = next(csv.DictReader(Path("found.csv").read_text().splitlines()))
+        (found,) = rows_of("found.csv")
         place = [float(found[name]) for name in ("lat", "lon", "height_ellipsoidal_m")]
         assert place[:2] == pytest.approx((46.15, 7.4), abs=1e-4)
         assert place[2] == pytest.approx(9000.0, abs=60.0)

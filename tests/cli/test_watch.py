@@ -1,6 +1,5 @@
 """`kcal watch` on folders, and its history in `kcal locate` and `kcal live`."""
 
-import csv
 import json
 import math
 import threading
@@ -12,7 +11,7 @@ import orjson
 import polars
 import pytest
 import torch
-from command_line import Command
+from command_line import Command, rows_of
 from PIL import Image
 from typer.testing import CliRunner
 from waiting import PATIENCE
@@ -51,8 +50,7 @@ def test_a_drift_is_found_told_and_drawn(site: Path, command: Command) -> None:
     found = command("watch", *words, "-o", history, "--picture", picture, "--parquet", site / "h.parquet", code=3)
     assert "beyond the limit of 0.005°" in " ".join(found.err.split())
     assert picture.stat().st_size > 10_000
-    with history.open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(history)
     assert [float(row["time"]) for row in rows] == [START + 60.0 * k for k in range(5)]
     assert polars.read_parquet(site / "h.parquet")["time"].to_list() == [float(row["time"]) for row in rows]
     assert float(rows[4]["relative_yaw_deg"]) == pytest.approx(0.02, abs=0.003)
@@ -121,15 +119,13 @@ def test_rows_are_located_by_the_rig_of_their_time(watched: Path, command: Comma
     words = ["locate", str(watched / "rig.json"), str(points), "--pixel-sigma", "0.02", "-o", str(watched / "out.csv")]
     found = command(*words, "--history", watched / "h.csv")
     assert "errors in calibration and mounting are not included" not in " ".join((found.out + found.err).split())
-    with (watched / "out.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(watched / "out.csv")
     assert [float(row["range_m"]) for row in rows[:2]] == pytest.approx([2000.0] * 2, rel=0.01)
     wide = [float(row["range_high_m"]) - float(row["range_low_m"]) for row in rows]
     assert wide[2] > 1.4 * wide[0]
     assert float(rows[2]["range_low_m"]) < 2000.0 < float(rows[2]["range_high_m"])
     command(*words)
-    with (watched / "out.csv").open() as file:
-        assert abs(float(next(csv.DictReader(file))["range_m"]) - 2000.0) > 60.0
+    assert abs(float(rows_of(watched / "out.csv")[0]["range_m"]) - 2000.0) > 60.0
 
 
 def test_what_locate_needs_for_it(watched: Path, command: Command) -> None:
@@ -160,8 +156,7 @@ def test_live_tracks_have_the_sigma_of_the_moment(watched: Path, command: Comman
         output = watched / f"{name}.csv"
         words = ["live", str(watched / "rig.json"), "--detections", str(source), "-o", str(output)]
         command(*words, "--history", watched / "h.csv")
-        with output.open() as file:
-            last = list(csv.DictReader(file))[-1]
+        last = rows_of(output)[-1]
         assert float(last["range_low_m"]) < 1500.0 < float(last["range_high_m"])
         sigmas[name] = float(last["range_high_m"]) - float(last["range_low_m"])
     assert sigmas["dark"] > 1.3 * sigmas["day"]
@@ -241,5 +236,4 @@ def test_videos_are_watched_too_and_continue(tmp_path: Path, command: Command) -
     words += ["-o", str(tmp_path / "h.csv"), "--every", "2"]
     for _ in range(2):
         command(*words)
-        with (tmp_path / "h.csv").open() as file:
-            assert [float(row["time"]) for row in csv.DictReader(file)] == [0.0, 2.0]
+        assert [float(row["time"]) for row in rows_of(tmp_path / "h.csv")] == [0.0, 2.0]

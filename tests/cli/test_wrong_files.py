@@ -8,7 +8,6 @@ import json
 import random
 import shlex
 import shutil
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -18,13 +17,14 @@ import pytest
 import torch
 from calibrate_scenes import observe
 from click.testing import Result
+from command_line import Command
 from printed_boards import printed_points, printed_views
 from typer.main import get_command
 from typer.testing import CliRunner
 
 from kcal import Board, Camera, FileError, KcalError, Observations, View, load_camera, load_rig, save_camera, save_rig
 from kcal.calibrate import load_measured_board
-from kcal.cli.main import app, main
+from kcal.cli.main import app
 from kcal.file_kind import file_kind
 from kcal.lens import load_lookup
 from scripts.fuzz import commands as fuzz
@@ -186,10 +186,7 @@ def test_a_wrong_file_is_named(
         ("rectify picture.png camera.json -o s", "kcal rectify camera.json picture.png -o s"),
         ("report seen.json --observations=camera.json", "kcal report camera.json --observations=seen.json"),
         ("bake rig.json -o new.npz", "kcal bake rig.json:left -o new.npz"),
-        (
-            "rig right.json camera.json --baseline 10±1 -o n.json",
-            "kcal rig camera.json right.json --baseline '10±1' -o n.json",
-        ),
+        ("rig right.json camera.json --baseline 10±1 -o n", "kcal rig camera.json right.json --baseline '10±1' -o n"),
     ],
 )
 def test_files_in_each_others_place_are_exchanged(
@@ -363,20 +360,10 @@ def test_printing_is_the_default(tmp_path: Path, command: list[str]) -> None:
 # `kcal bake`: tables beside the camera, with their error in words.
 
 
-def run_bake(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["kcal", "bake", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
-
-
-def test_it_writes_what_it_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_writes_what_it_says(tmp_path: Path, command: Command) -> None:
     camera = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.02, 1e-3, -1e-3])
     path = save_camera(camera, tmp_path / "left.camera.json")
-    assert run_bake(monkeypatch, str(path), "--tolerance", "1e-4") == 0
-    said = capsys.readouterr().out
+    said = command("bake", path, "--tolerance 1e-4").out
     lookup = load_lookup(tmp_path / "left_lookup.npz")
     assert lookup.source == camera.fingerprint
     assert max(lookup.bound) <= 1e-4
@@ -386,15 +373,12 @@ def test_it_writes_what_it_says(
     assert "answers for" not in said
 
 
-def test_it_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_bake(monkeypatch, str(tmp_path / "none.json")) == 1
-    assert "cannot read" in capsys.readouterr().err
+def test_it_refuses(tmp_path: Path, command: Command) -> None:
+    assert "cannot read" in command("bake", tmp_path / "none.json", code=1).err
     camera = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), model="pinhole")
     path = save_camera(camera, tmp_path / "left.camera.json")
-    assert run_bake(monkeypatch, str(path), "-o", str(path)) == 1
-    assert "input" in capsys.readouterr().err
-    assert run_bake(monkeypatch, str(path), "--tolerance", "0") == 2
+    assert "input" in command("bake", path, "-o", path, code=1).err
+    command("bake", path, "--tolerance 0", code=2)
     # A table fine enough for a focal length of 1 px would take minutes, only to fail.
     camera = Camera.build(focal=(60, 0.1), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.05])
-    assert run_bake(monkeypatch, str(save_camera(camera, path))) == 1
-    assert "check the camera's focal lengths" in capsys.readouterr().err
+    assert "check the camera's focal lengths" in command("bake", save_camera(camera, path), code=1).err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import signal
 import sys
@@ -19,6 +20,18 @@ class Said(NamedTuple):
 
     out: str
     err: str
+
+
+def invoked(*words: object) -> str:
+    """What a command prints; its error is raised."""
+    from typer.testing import CliRunner
+
+    from kcal.cli.main import app
+
+    done = CliRunner().invoke(app, [str(word) for word in words])
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    return done.output
 
 
 class Command:
@@ -55,6 +68,12 @@ class Command:
 def contents() -> dict[Path, bytes]:
     """All files and folders below the working folder."""
     return {path: path.read_bytes() if path.is_file() else b"" for path in Path().rglob("*")}
+
+
+def rows_of(path: str | Path) -> list[dict[str, str]]:
+    """The lines of a CSV file."""
+    with Path(path).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def terminate() -> None:

@@ -9,19 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from calibrate_scenes import BOARD, camera, motions
+from calibrate_scenes import camera, motions, observe, pixels_of
 from capture_frames import BOARD as PHOTOGRAPHED
 from capture_frames import images
 from locate_rigs import located_pairs, pinhole_rig
 from starlette.applications import Starlette
-from track_scenes import pairs_of, tracked_site
+from track_scenes import pairs_of, run_of, tracked_site
 from typer.testing import CliRunner
 
-from kcal import Localizer, Observations, Origin, View
+from kcal import Origin
 from kcal.capture.session import CaptureSession, capture_app
 from kcal.cli.main import app
 from kcal.io.images import write_png
-from kcal.locate.points import PointLocator
 from kcal.mark.guide import open_pictures
 from kcal.mark.items import Add, Mark, Put
 from kcal.mark.marking_service import Desk
@@ -107,7 +106,7 @@ def capturing(folder: Path) -> Iterator[Opened]:
 def crowded_map(targets: int) -> Iterator[LiveMap]:
     """A live map of targets at 100 m to 3 km, many of them side by side."""
     site = tracked_site(0.01)
-    page = LiveMap(PointLocator(Localizer(site.rig.placed(origin=site.origin, heading_deg=0.0))).located(), 0)
+    page = LiveMap(run_of(site), 0)
     reach = 100.0 * 30.0 ** torch.linspace(0, 1, targets).double()
     side = 0.3 * reach * torch.sin(2.4 * torch.arange(targets).double())
     left, right = site.rig(torch.stack([side, 0 * side, reach], -1))[0].unbind(-2)
@@ -127,11 +126,7 @@ def live(folder: Path) -> Iterator[Opened]:
 def verdict(folder: Path) -> Iterator[Opened]:
     """`kcal report` on a camera with its views."""
     truth = camera("opencv5")
-    rotation, translation = motions(truth, 14, 3)
-    pixels, _ = truth.project(BOARD.points @ rotation.transpose(-1, -2) + translation[:, None])
-    pixels = pixels + 0.05 * torch.randn(pixels.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    views = [View(name=f"{i:02}", pixels=[tuple(p) for p in view]) for i, view in enumerate(pixels.tolist())]
-    Observations(board=BOARD, image_size=(640, 480), views=tuple(views)).save(folder / "left.obs.json")
+    observe(pixels_of(truth, motions(truth, 14, 3), noise=0.05)).save(folder / "left.obs.json")
     known, seen = folder / "left.camera.json", folder / "left.obs.json"
     run = CliRunner().invoke
     run(app, ["calibrate", str(seen), "-o", str(known), "--model", "opencv5"], catch_exceptions=False)

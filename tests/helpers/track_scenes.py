@@ -10,6 +10,8 @@ from torch import Tensor
 
 from kcal import Localizer, Origin, Rig
 from kcal.lens import rotation_from_vector
+from kcal.locate.points import PointLocator
+from kcal.locate.positions import Located
 from kcal.pipeline.pairing import ObjectViews
 from kcal.rig import RigCovariance, planned_rig
 
@@ -30,6 +32,11 @@ def tracked_site(yaw_deg: float = 0.0, **options: object) -> Localizer:
     known = {"origin": ORIGIN, "heading_deg": 0.0, "refraction": 0.0, "refraction_sigma": 0.0} | options
     rig.covariance = RigCovariance.of(rig, pose=pose)
     return Localizer(rig.placed(**known))  # type: ignore[arg-type]
+
+
+def run_of(site: Localizer) -> Located:
+    """What is located at that place, looking north."""
+    return PointLocator(Localizer(site.rig.placed(origin=site.origin, heading_deg=0.0))).located()
 
 
 def pairs_of(

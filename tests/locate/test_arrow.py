@@ -15,9 +15,9 @@ import pyarrow.parquet
 import pyogrio
 import pytest
 import torch
+from calibrate_scenes import BOARD, motions, observe, pixels_of
 
-from kcal import Board, Camera, InputError, Localizer, Observations, Origin, Rig, View, calibrate_camera, locate_points
-from kcal.lens import rotation_from_vector
+from kcal import Camera, InputError, Localizer, Origin, Rig, calibrate_camera, locate_points
 from kcal.locate import Marks, write_positions
 from kcal.locate.export import PositionWriter
 from kcal.locate.points import PointLocator
@@ -76,16 +76,12 @@ def test_a_geopackage_holds_points_and_regions(tmp_path: Path) -> None:
     assert table["name"].to_pylist() == list(MARKS.names)
     assert table["range_m"].to_pylist() == [run.positions[0].range_m, None, None]
     wkb = table[about["geometry_name"] or "wkb_geometry"].to_pylist()
-    assert np.frombuffer(wkb[0][-24:], "<f8").tolist() == [
-        run.positions[0].lon,
-        run.positions[0].lat,
-        run.positions[0].height,
-    ]
+    place = run.positions[0]
+    assert np.frombuffer(wkb[0][-24:], "<f8").tolist() == [place.lon, place.lat, place.height]
     assert wkb[1:] == [None, None]
     info = pyogrio.read_info(path, layer="regions")
     assert (info["features"], info["geometry_type"]) == (1, "MultiPolygon")
     west, south, east, north = info["total_bounds"]
-    place = run.positions[0]
     assert west < place.lon < east
     assert south < place.lat < north
 
@@ -125,16 +121,12 @@ def test_an_empty_table_has_the_same_columns() -> None:
 
 
 def test_corners_and_residuals_are_tables() -> None:
-    board, views = Board(columns=7, rows=6, square=0.05), []
-    tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 0], [0, 0.5, 0.2], [0.1, -0.5, 0]], dtype=torch.float64)
-    for i, rotation in enumerate(rotation_from_vector(tilts)):
-        points = board.points @ rotation.T + torch.tensor([-0.15, -0.14, 0.7], dtype=torch.float64)
-        pixels = CAMERA.project(points)[0].tolist()
-        views.append(View(name=f"view {i}", pixels=[None, *pixels[1:]]))
-    seen = Observations(board=board, image_size=(1920, 1080), views=views)
+    pixels = pixels_of(CAMERA, motions(CAMERA, 4, 1))
+    pixels[:, 0] = math.nan
+    seen = observe(pixels, size=CAMERA.size)
     corners = polars.DataFrame(seen)
     assert corners.height == 4 * 41
-    assert corners.row(0) == ("view 0", 1, *board.points[1].tolist(), *views[0].pixels[1])
+    assert corners.row(0) == ("v00", 1, *BOARD.points[1].tolist(), *seen.views[0].pixels[1])
     result = calibrate_camera(seen)
     table = polars.DataFrame(result)
     assert table.columns == [*corners.columns, "residual_u", "residual_v"]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from command_line import Command
+from command_line import Command, rows_of
 
 from kcal import InputError, Localizer, Origin, load_rig, save_rig
 from kcal.locate import Marks, check_ranges
@@ -28,13 +27,10 @@ def test_the_same_intervals_as_the_command(tmp_path: Path, command: Command) -> 
     marks.write_text("\n".join(["left_u,left_v,right_u,right_v", *rows]) + "\n")
     out = tmp_path / "positions.csv"
     command("locate", SAMPLE, marks, "--pixel-sigma 0.1 -o", out)
-    for localize in (
-        Localizer(load_rig(SAMPLE), pixel_sigma=0.1),
-        Localizer.from_file(SAMPLE, pixel_sigma=0.1),
-    ):
+    for localize in (Localizer(load_rig(SAMPLE), pixel_sigma=0.1), Localizer.from_file(SAMPLE, pixel_sigma=0.1)):
         assert localize.included == ("marks", "calibration", "mounting")
         found = localize(LEFT, RIGHT)
-        for i, row in enumerate(csv.DictReader(out.open())):
+        for i, row in enumerate(rows_of(out)):
             assert float(row["range_low_m"]) == float(found.range_low[i])
             assert float(row["range_high_m"]) == float(found.range_high[i])
             assert float(row["cov_ee_m2"]) == float(found.covariance[i, 0, 0])

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from kornia.geometry.subpix import spatial_soft_argmax2d
 from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, standing, tensor, turned
 
 from kcal import Camera, DegenerateError, InputError, Origin, PositionStatus, Rig
@@ -191,11 +190,12 @@ BAD = [
     # left, right, status; f = 1600 px, b = 10 m, center (959.5, 539.5), sigma 0.3 px
     ((980.0, 540.0), (970.0, 540.0), PositionStatus.OK),
     ((980.0, 540.0), (979.5, 540.0), PositionStatus.BEARING_ONLY),
-    ((970.0, 540.0), (970.0, 540.0), PositionStatus.PARALLEL),
+    ((-0.5, 1079.5), (-0.5, 1079.5), PositionStatus.PARALLEL),
     ((960.0, 540.0), (970.0, 540.0), PositionStatus.PARALLEL),
     ((math.nan, 540.0), (970.0, 540.0), PositionStatus.NOT_FINITE),
     ((980.0, 540.0), (970.0, math.inf), PositionStatus.NOT_FINITE),
     ((-0.6, 540.0), (-20.0, 540.0), PositionStatus.OUTSIDE_IMAGE),
+    ((980.0, 540.0), (970.0, 1079.51), PositionStatus.OUTSIDE_IMAGE),
     ((980.0, 540.0), (970.0, 540.0), PositionStatus.MASKED),
     ((980.0, 540.0), (970.0, 540.0), PositionStatus.BAD_COVARIANCE),
     ((980.0, 540.0), (970.0, 540.0), PositionStatus.BAD_COVARIANCE),
@@ -218,10 +218,10 @@ def test_statuses_and_no_nan_in_values_or_gradients() -> None:
     left = tensor(*(row[0] for row in BAD)).requires_grad_()
     right = tensor(*(row[1] for row in BAD)).requires_grad_()
     cov = (0.09 * torch.eye(4, dtype=torch.float64)).repeat(len(BAD), 1, 1)
-    cov[8, 0, 0], cov[9, 1, 2] = -1.0, math.nan
+    cov[9, 0, 0], cov[10, 1, 2] = -1.0, math.nan
     cov.requires_grad_()
     mask = torch.ones(len(BAD), dtype=torch.bool)
-    mask[7] = False
+    mask[8] = False
     found = Localizer(pinhole_rig().placed(origin=ORIGIN, heading_deg=0.0))(left, right, cov, mask)
     assert [PositionStatus(s).name for s in found.status.tolist()] == [row[2].name for row in BAD]
     for name, value in found._asdict().items():
@@ -269,24 +269,6 @@ def test_gradients_of_everything() -> None:
     assert torch.autograd.gradcheck(outputs, inputs, eps=1e-4, rtol=1e-5, atol=1e-3)
 
 
-def test_gradients_reach_freed_parameters_of_a_camera() -> None:
-    rig = real_rig()
-    left, right = rig(spread_points(tensor(800.0)))[0].unbind(-2)
-    module = localizer(rig)
-    rig.right.free("cx")
-    module(left, right).enu.norm().backward()
-    moved = {
-        sign: Camera(rig.right.params.detach() + sign * 1e-3 * tensor(0, 0, 1.0, *[0] * 7), size=SIZE, model="opencv5")
-        for sign in (1, -1)
-    }
-    ranges = {}
-    for sign, camera in moved.items():
-        other = Rig.pair(rig.left, camera, rig.right_from_left_rotation, rig.right_from_left_translation)
-        ranges[sign] = localizer(other)(left, right).enu.norm().item()
-    slope = (ranges[1] - ranges[-1]) / 2e-3
-    assert rig.right.params.grad[2].item() == pytest.approx(slope, rel=1e-6)
-
-
 def test_batches_pieces_and_precision() -> None:
     points = spread_points(torch.linspace(50, 3000, 40_000, dtype=torch.float64))
     left, right = RIG(points)[0].unbind(-2)
@@ -320,57 +302,19 @@ def test_sensitivities() -> None:
     assert moved.abs().tolist() == pytest.approx([4.3633, 0.17453], rel=2e-3)
 
 
-def test_a_detector_is_trained_through_it() -> None:
-    """Heat maps, kornia's soft-argmax, a crop's offset, meters: the loss is the position, no pixel is given."""
-    torch.manual_seed(0)
-    rig = pinhole_rig(1600.0, 10.0)
-    truth = torch.stack(
-        [torch.linspace(-30, 30, 16), torch.linspace(8, -8, 16), torch.linspace(250, 600, 16)], -1
-    ).double()
-    left, right = rig(truth)[0].unbind(-2)
-    corners = [pixels.detach().round() - 16 for pixels in (left, right)]
-    grid = torch.arange(33.0)
-    crops = []
-    for pixels, corner in zip((left, right), corners, strict=True):
-        u, v = ((pixels - corner).float()[:, i, None, None] for i in (0, 1))
-        crops.append(torch.exp(-((grid - u) ** 2 + (grid[:, None] - v) ** 2) / 8.0))
-    images = torch.stack(crops, 1).reshape(32, 1, 33, 33) + 0.02 * torch.rand(32, 1, 33, 33)
-    net = torch.nn.Sequential(torch.nn.Conv2d(1, 4, 5, padding=2), torch.nn.ReLU(), torch.nn.Conv2d(4, 1, 5, padding=2))
-    module = Localizer(rig.placed(origin=ORIGIN, heading_deg=0.0))
-    aim = truth @ enu_from_cam(0.0).T
-
-    def located() -> Localization:
-        spots = spatial_soft_argmax2d(8.0 * net(images), normalized_coordinates=False).reshape(16, 2, 2)
-        return module(spots[:, 0] + corners[0], spots[:, 1] + corners[1])
-
-    def range_error(found: Localization) -> float:
-        return ((1.0 / found.inverse_range.detach() - aim.norm(dim=-1)).abs()).median().item()
-
-    optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
-    before = range_error(located())
-    for _ in range(60):
-        found = located()
-        loss = ((found.inverse_range * aim.norm(dim=-1) - 1.0) ** 2).mean() + (
-            (found.bearing - aim / aim.norm(dim=-1, keepdim=True)) ** 2
-        ).sum(-1).mean() * 1e4
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert range_error(located()) < 0.3 * before
-
-
 def test_bad_arguments() -> None:
     module, marks = localizer(), tensor([980.0, 540.0])
     for arguments, message in (
         ((marks.long(), marks), "floating point"),
         ((marks, marks[0]), "same shape"),
+        ((marks[0], marks[0]), "same shape"),
         ((marks, marks, torch.eye(2).double()), "cov"),
         ((marks, marks, None, torch.ones(1)), "bool"),
     ):
         with pytest.raises(InputError, match=message):
             module(*arguments)
     for options, message in (
-        ({"pixel_sigma": 0.0}, "pixel_sigma"),
+        *(({"pixel_sigma": wrong}, "pixel_sigma") for wrong in (0.0, -1.0, math.nan, math.inf, 1e300, 1e-300)),
         ({"refraction": 13.0}, "refraction"),
         ({"refraction_sigma": -0.1}, "refraction_sigma"),
         ({"refraction_sigma": math.nan}, "refraction_sigma"),

@@ -156,10 +156,6 @@ def test_times_without_anything_in_common_are_refused() -> None:
     late = torch.arange(1000.0, 1010.0, 1.0, dtype=torch.float64)
     unknown = torch.full((len(late),), math.nan, dtype=torch.float64)
     pixels = torch.full((len(late), 2), 500.0, dtype=torch.float64)
+    sighting = Sighting(label="drone", camera=0, times=late, pixels=pixels, sigma=unknown)
     with pytest.raises(InputError, match="clocks"):
-        match_moving(
-            [own],
-            [Sighting(label="drone", camera=0, times=late, pixels=pixels, sigma=unknown)],
-            (CAMERA, CAMERA),
-            NAMES,
-        )
+        match_moving([own], [sighting], (CAMERA, CAMERA), NAMES)

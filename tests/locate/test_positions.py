@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import csv
 import datetime
-import io
 import itertools
 import json
 import math
@@ -13,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from locate_rigs import located_pairs, pinhole_rig, real_rig, spread_points, tensor
+from locate_rigs import located_pairs, pinhole_rig, tensor
 
 from kcal import FileError, InputError, Origin, PositionStatus
-from kcal.locate import enu_from_cam, enu_to_geodetic, find_geoid, geodetic_to_enu
+from kcal.locate import find_geoid, geodetic_to_enu
 from kcal.locate.export import cot_events, write_positions
 from kcal.locate.positions import Located, Position
 from kcal.rig import RigCovariance
@@ -52,28 +50,6 @@ def test_exchanged_columns_are_named() -> None:
     assert "the rig has turned" in reason
 
 
-def test_end_to_end_with_real_lenses() -> None:
-    rig, truth = real_rig(), spread_points(torch.logspace(2, 3.7, 9, dtype=torch.float64))
-    left, right = rig(truth)[0].unbind(-2)
-    located = located_pairs(
-        rig, left, right, origin=ORIGIN, heading_deg=200.0, pitch_deg=3.0, roll_deg=-2.0, **STRAIGHT
-    )
-    enu = truth @ enu_from_cam(200.0, 3.0, -2.0).T
-    assert located.count == 9
-    assert (located.enu - enu).norm(dim=-1).max() < 1e-6
-    geodetic = enu_to_geodetic(enu, ORIGIN)
-    for position, true_enu, (lat, lon, height) in zip(located.positions, enu, geodetic.tolist(), strict=True):
-        # 1e-11 degrees is a micrometer.
-        assert (position.lat, position.lon) == pytest.approx((lat, lon), abs=1e-11)
-        assert position.height == pytest.approx(height, abs=1e-6)
-        assert position.range_m == pytest.approx(float(true_enu.norm()), rel=1e-9)
-        assert position.range_low_m < position.range_m < position.range_high_m
-        assert position.azimuth_deg == pytest.approx(math.degrees(math.atan2(true_enu[0], true_enu[1])) % 360, abs=1e-9)
-        assert position.elevation_deg == pytest.approx(math.degrees(math.asin(true_enu[2] / true_enu.norm())), abs=1e-9)
-        assert position.reason == ""
-    assert [position.name for position in located.positions] == [str(i) for i in range(1, 10)]
-
-
 def test_a_point_ahead_of_a_rig_that_looks_east_is_east() -> None:
     position = mixed().positions[0]
     east, north, up = position.enu
@@ -88,14 +64,8 @@ def test_a_point_ahead_of_a_rig_that_looks_east_is_east() -> None:
 def test_each_failure_says_why_and_carries_no_number_that_could_be_mistaken() -> None:
     located = mixed()
     by_name = {position.name: position for position in located.positions}
-    assert {name: position.status.name for name, position in by_name.items()} == {
-        "mast": "OK",
-        "far": "BEARING_ONLY",
-        "parallel": "PARALLEL",
-        "mismatch": "PARALLEL",
-        "outside": "OUTSIDE_IMAGE",
-        "nothing": "NOT_FINITE",
-    }
+    names = ["OK", "BEARING_ONLY", "PARALLEL", "PARALLEL", "OUTSIDE_IMAGE", "NOT_FINITE"]
+    assert [position.status.name for position in located.positions] == names
     assert located.count == 1
     for name, position in by_name.items():
         if name != "mast":
@@ -193,24 +163,6 @@ def test_geojson_follows_rfc_7946(tmp_path: Path) -> None:
     assert far["reason"]
 
 
-def test_csv_keeps_every_digit(tmp_path: Path) -> None:
-    located = mixed()
-    path = write_positions(tmp_path / "points.csv", located)
-    rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
-    assert [row["name"] for row in rows] == [position.name for position in located.positions]
-    position = located.positions[0]
-    for column, value in (
-        ("lat", position.lat),
-        ("lon", position.lon),
-        ("height_ellipsoidal_m", position.height),
-        ("east_m", position.enu[0]),
-        ("range_low_m", position.range_low_m),
-        ("reprojection_right_px", position.reprojection_px[1]),
-    ):
-        assert float(rows[0][column]) == value
-    assert (rows[1]["status"], rows[1]["lat"], rows[1]["range_high_m"]) == ("bearing_only", "", "inf")
-
-
 def test_covariances_circles_and_slopes_of_a_position() -> None:
     position = one((975.5, 539.5), (959.5, 539.5), pixel_sigma=0.1)
     # Z² / (f b) = 62.5 m/px at 1 km, and 17.45 m for 0.01 degrees.
@@ -243,21 +195,11 @@ def test_geoid_heights_are_stated(tmp_path: Path) -> None:
 def test_kml(tmp_path: Path) -> None:
     located = mixed()
     space = {"k": "http://www.opengis.net/kml/2.2"}
-    document = ET.fromstring(write_positions(tmp_path / "points.kml", located).read_bytes())
-    names = [element.text for element in document.findall(".//k:Placemark/k:name", space)]
-    assert names == ["left camera", "right camera", "mast", "mast, 95 %"]
-    mast = document.find(".//k:Placemark[k:name='mast']/k:Point", space)
+    raw = ET.fromstring(write_positions(tmp_path / "points.kml", located).read_bytes())
+    mast = raw.find(".//k:Placemark[k:name='mast']/k:Point", space)
     # Without a geoid an ellipsoidal height must not be taken for one above the sea.
     assert mast.find("k:altitudeMode", space).text == "clampToGround"
-    assert [float(x) for x in mast.find("k:coordinates", space).text.split(",")] == [
-        located.positions[0].lon,
-        located.positions[0].lat,
-    ]
-
-
-def test_kml_in_another_reader(tmp_path: Path) -> None:
     kml = pytest.importorskip("fastkml.kml", reason="fastkml is not installed")
-    located = mixed()
     (document,) = kml.KML.parse(write_positions(tmp_path / "points.kml", located)).features
     places = {place.name: place for place in document.features}
     assert set(places) == {"left camera", "right camera", "mast", "mast, 95 %"}

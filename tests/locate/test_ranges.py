@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from locate_rigs import pinhole_rig, real_rig, tensor
+from locate_rigs import pinhole_rig, tensor
 
 from kcal import Localizer
 from kcal.locate.stereo import PositionStatus, range_interval
@@ -30,19 +30,6 @@ def test_interval_covers_95_percent_of_noisy_marks(z: float) -> None:
     assert 0.02 < above.item() < 0.03
 
 
-def test_interval_covers_through_real_lenses_and_off_axis() -> None:
-    rig = real_rig()
-    point = tensor([900.0, 500.0, 2000.0])
-    pixels, seen = rig(point)
-    (left, right), seen = pixels.unbind(-2), seen.all(-1)
-    assert seen.all()
-    generator = torch.Generator().manual_seed(12)
-    noise = 0.5 * torch.randn(2, N, 2, dtype=torch.float64, generator=generator)
-    result = Localizer(rig, pixel_sigma=0.5)(left + noise[0], right + noise[1])
-    covered = (result.range_low <= point.norm()) & (point.norm() <= result.range_high)
-    assert 0.94 < covered.double().mean().item() < 0.96
-
-
 def test_disparity_at_and_below_zero_is_bearing_only_with_an_open_end() -> None:
     rig = pinhole_rig(1600.0, 10.0)
     disparity = tensor(3.2, 1.3, 1.25, 0.2, 0.0, -0.2, -5.0)
@@ -51,11 +38,8 @@ def test_disparity_at_and_below_zero_is_bearing_only_with_an_open_end() -> None:
     result = Localizer(rig, pixel_sigma=0.3)(left, right)
     # 3 sigma of the disparity are 3 * 0.3 * sqrt(2) = 1.27 px; 1.96 sigma are 0.83 px.
     assert torch.isinf(result.range_high).tolist() == [False, False, False, True, True, True, True]
-    assert [PositionStatus(s).name for s in result.status.tolist()] == [
-        *["OK"] * 2,
-        *["BEARING_ONLY"] * 2,
-        *["PARALLEL"] * 3,
-    ]
+    names = ["OK"] * 2 + ["BEARING_ONLY"] * 2 + ["PARALLEL"] * 3
+    assert [PositionStatus(s).name for s in result.status.tolist()] == names
     # Nearest possible: 16 000 px m / (d + 0.83 px); diverging by 5 px no range explains the marks.
     expected = [16_000 / (d + 1.959964 * 0.3 * math.sqrt(2)) for d in (3.2, 1.3, 1.25, 0.2, 0.0, -0.2)]
     # Disparity over focal length is the tangent of the parallax: 1e-5 relative at these angles.

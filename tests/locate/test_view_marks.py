@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_line import Command
+from command_line import Command, rows_of
 from typer.testing import CliRunner
 
 from kcal.cli.main import app
@@ -23,7 +23,6 @@ from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks, read_mark_chunks, read_marks
 from kcal.locate.points import PointLocator, PositionSample
 from kcal.locate.stations import stations_of
-from kcal.locate.survey import read_features
 from kcal.locate.tables import read_chunks
 from kcal.rig import RigCovariance, planned_rig
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
@@ -88,33 +87,6 @@ def test_a_long_table_must_be_in_order(tmp_path: Path, monkeypatch: pytest.Monke
         list(read_mark_chunks(path, CAMERAS))
 
 
-def test_times_keep_things_apart(tmp_path: Path) -> None:
-    path = tmp_path / "times.csv"
-    path.write_text(
-        "name,camera,u,v,time\nboat,a,1,2,10.0\nboat,b,3,4,10.0\nboat,a,5,6,11.0\nbuoy,c,7,8,10.0\n", encoding="utf-8"
-    )
-    views = read_marks(path, CAMERAS)
-    assert views.names == ("boat 10.0", "boat 11.0", "buoy")
-    assert views.extras["time"] == ["10.0", "11.0", "10.0"]
-    assert views.pixels[0].nan_to_num(nan=-1).tolist() == [[1, 2], [3, 4], [-1, -1]]
-    path.write_text("name,camera,u,v,time\nboat,a,1,2,10.0\nboat,a,3,4,10.0\n")
-    with pytest.raises(FileError, match="line 3: 'boat' was marked in a before"):
-        read_marks(path, CAMERAS)
-
-
-def test_features_of_any_two_cameras(tmp_path: Path) -> None:
-    path = tmp_path / "far.csv"
-    rows = ["summit,a,1,2,20000,2000,", "summit,c,3,4,20000,2000,", "cloud,b,5,6,,,5000", "cloud,c,7,8,,,5000"]
-    path.write_text("\n".join(["name,camera,u,v,range,range_sigma,beyond", *rows, "rock,a,9,9,,,", "rock,b,9,9,,,"]))
-    found = read_features(path, 0.4, CAMERAS)
-    assert found.names == ("summit", "cloud", "rock")
-    assert found.pixels[:, :, 0].isnan().tolist() == [[False, True, False], [True, False, False], [False, False, True]]
-    assert found.inverse_range.tolist() == pytest.approx([1 / 20_000, 0.5 / 5000, 0.0], rel=0.02)
-    assert found.inverse_range_sigma[0] == pytest.approx(2000 / 20_000**2, rel=0.02)
-    assert math.isinf(float(found.inverse_range_sigma[2]))
-    assert found.each_sigma.nansum(1).tolist() == [0.8] * 3
-
-
 def test_a_long_table_is_located_as_a_short_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
@@ -166,8 +138,7 @@ def test_one_camera_and_a_terrain(tmp_path: Path, command: Command) -> None:
     assert CliRunner().invoke(app, words).exit_code != 0, "a bearing is no position"
     given = ["--terrain", str(tmp_path / "hills.asc"), "--terrain-sigma", "2"]
     command(*words, *given)
-    with (tmp_path / "out.csv").open() as file:
-        (row,) = csv.DictReader(file)
+    (row,) = rows_of(tmp_path / "out.csv")
     there = enu_to_geodetic(geodetic_to_enu(spot, ORIGIN), ORIGIN)
     assert float(row["lat"]) == pytest.approx(float(there[0]), abs=2e-5)
     assert float(row["height_ellipsoidal_m"]) == pytest.approx(631.0, abs=0.5)

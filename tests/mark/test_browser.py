@@ -71,7 +71,7 @@ def test_a_whole_site_while_the_server_is_killed(site: tuple[Path, MarkingSite],
     arguments += ["--cameras", *(str(folder / f"{side}.camera.json") for side in ("left", "right"))]
     arguments += ["--landmarks", str(folder / "survey.csv"), "-o", str(tmp_path / "marks.csv")]
     random, port = np.random.default_rng(2), free_port()
-    names = [point.name for point in (*LANDMARKS, *TARGETS)]
+    names = [point.name for point in (*LANDMARKS[:8], *TARGETS[:2])]
     # Each at another moment of its thing: right after a click was made, or after all was answered.
     kills = dict(zip(random.choice(len(names), KILLS, replace=False).tolist(), range(KILLS), strict=True))
     server = Server(arguments, port, tmp_path)
@@ -111,7 +111,7 @@ def test_a_whole_site_while_the_server_is_killed(site: tuple[Path, MarkingSite],
         server.stop()
     assert complaints == []
     assert covered == []
-    assert (dots, names >= 6) == (2 + len(LANDMARKS) + len(TARGETS), True)
+    assert (dots, names >= 6) == (2 + len(LANDMARKS) + 2, True)
     assert solved["solved"]
     assert len(solved["promises"]) == 3
     assert [item["name"] for item in things if item["residual"] and not item["residual"]["used"]] == []

@@ -259,14 +259,6 @@ class TestLiveRig:
         for after in (total(half), total(by_hand)):
             assert max(b / a for a, b in zip(before, after, strict=True)) < 1.01
 
-    def test_marks_have_their_own_sigmas(self) -> None:
-        right = torch.tensor([[1.0, 1.0], [math.nan, math.nan]])
-        variances = torch.tensor([[0.04, 0.02, 0.25, 0.25], [0.01, 0.01, math.nan, math.nan]]).double()
-        found = Marks.of_pair(("a", "b"), torch.zeros(2, 2), right, torch.diag_embed(variances)).sigmas(0.3)
-        torch.testing.assert_close(found[0], torch.tensor([math.sqrt(0.03), 0.5]).double())
-        assert float(found[1, 0]) == pytest.approx(0.1)
-        assert math.isnan(float(found[1, 1]))
-
     def test_a_wrong_landmark_is_named(self, site: MarkingSite) -> None:
         names = [point.name for point in LANDMARKS]
         marks = marks_at(site, names)

@@ -71,8 +71,6 @@ def test_data_need_the_token(client: TestClient, path: str) -> None:
 @pytest.mark.parametrize(
     ("body", "status", "message"),
     [
-        (b"{", 400, "Expecting"),
-        (b"\xff", 400, "utf-8"),
         (json.dumps({"key": "k", "action": {"do": "undo"}}).encode(), 422, "key: String should have at least 8"),
         (json.dumps({"key": "12345678", "action": {"do": "undo"}}).encode(), 400, "nothing to undo"),
         (json.dumps({"key": "12345678", "action": {"do": "rm"}}).encode(), 422, "does not match any of the expected"),
@@ -86,10 +84,7 @@ def test_data_need_the_token(client: TestClient, path: str) -> None:
                                                    "mark": {**MARK, "cov": [1, 2, 1]}}}).encode(), 422,
          "the covariance is not positive definite"),
         (b" " * (1 << 21), 413, "too large"),
-        (b"[" * 100_000, 400, "nested too deeply"),
-        (b'{"key": "12345678", "action": ' + b'{"do":' * 400 + b"1" + b"}" * 401, 400, "nested too deeply"),
         (b'{"key": "12345678", "action": ' + b"[" * 900 + b"]" * 900 + b"}", 400, "nested too deeply"),
-        (b'{"key": "12345678", "action": {"do": "undo", "n": ' + b"9" * 5000 + b"}}", 400, "cannot be read"),
     ],
 )  # fmt: skip
 def test_bad_requests(client: TestClient, body: bytes, status: int, message: str) -> None:

@@ -42,6 +42,15 @@ def work(session: Session) -> None:
     session.do(put("truck", "right", mark(45.125, 60.75, 0.05), matched=True), "key-0006")
 
 
+def kept(session: Session, survey: Path | None = None) -> Session:
+    """The session that begins where this one, which ends, has ended: with the same state."""
+    state = session.state
+    session.close()
+    again = Session(session.files.marks, survey)
+    assert again.state == state
+    return again
+
+
 @pytest.fixture
 def survey(tmp_path: Path) -> Path:
     path = tmp_path / "survey.csv"
@@ -112,11 +121,7 @@ def test_a_place_that_no_survey_has_is_refused(tmp_path: Path, survey: Path) -> 
         session.do(SurveyPlace(do="survey", name=name, place=Place(at=at, sigma=1.0)), f"key-of-{name}")
     with pytest.raises(FileError, match="exchanged"):
         read_survey(session.files.landmarks)
-    state = session.state
-    session.close()
-    again = Session(tmp_path / "marks.csv")
-    assert again.state == state
-    again.close()
+    kept(session).close()
 
 
 def test_undo_to_the_beginning(tmp_path: Path, survey: Path) -> None:
@@ -201,15 +206,18 @@ class FullDisk:
     """Takes so many more bytes of the log, and then none: `os.write` writes a part first, as it may."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, left: int) -> None:
-        self.left, self._write, self._sync = left, os.write, os.fsync
+        self.left, self._write = left, os.write
         monkeypatch.setattr("kcal.mark.session.os.write", self.write)
 
     def write(self, file: int, data: bytes) -> int:
         if not self.left:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self.refuse()
         written = self._write(file, data[: self.left])
         self.left -= written
         return written
+
+    def refuse(self, *_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @pytest.mark.parametrize("left", [0, 1, 50, 10**9])
@@ -220,13 +228,9 @@ def test_a_full_disk_loses_nothing_that_was_acknowledged(
     work(session)
     before, log, version = session.state, session.files.log.read_bytes(), session.version
     with monkeypatch.context() as patched:
-        FullDisk(patched, left)
+        disk = FullDisk(patched, left)
         if left == 10**9:
-
-            def unsynced(_: int) -> None:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-            patched.setattr("kcal.mark.session.os.fsync", unsynced)
+            patched.setattr("kcal.mark.session.os.fsync", disk.refuse)
         for number in range(3):
             with pytest.raises(FileError, match="the disk is full; this was not done"):
                 session.do(put("post", "left", mark(77.0, 1.0)), f"key-full{number}")
@@ -234,11 +238,7 @@ def test_a_full_disk_loses_nothing_that_was_acknowledged(
     # Ten marks afterwards, of which the first is one that was refused.
     for number in range(10):
         session.do(put("post", "left", mark(float(number), 1.0)), f"key-full{number}")
-    after = session.state
-    session.close()
-    again = Session(tmp_path / "marks.csv", survey)
-    assert again.state == after
-    assert again.notes == []
+    assert kept(session, survey).notes == []
 
 
 def test_nothing_is_left_where_even_cutting_off_fails(
@@ -264,11 +264,7 @@ def test_nothing_is_left_where_even_cutting_off_fails(
             with pytest.raises(FileError, match="cannot write"):
                 session.do(put("post", "left", mark(77.0, 1.0)), f"key-full{number}")
     session.do(put("post", "left", mark(88.0, 1.0)), "key-good")
-    after = session.state
-    session.close()
-    again = Session(tmp_path / "marks.csv", survey)
-    assert again.state == after
-    assert again.notes == []
+    assert kept(session, survey).notes == []
 
 
 def test_tables_that_a_full_disk_did_not_take_are_written_later(
@@ -317,9 +313,7 @@ def test_a_limit_of_the_system_is_a_full_disk(tmp_path: Path, survey: Path) -> N
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert session.state == before
     session.do(put("post", "left", mark(5.0, 1.0)), "key-full0")
-    after = session.state
-    session.close()
-    assert Session(tmp_path / "marks.csv", survey).state == after
+    kept(session, survey)
 
 
 def test_marks_of_a_target_are_of_one_moment(tmp_path: Path, survey: Path) -> None:
@@ -416,10 +410,7 @@ def test_a_click_is_known_to_one_pixel_of_the_screen(
     assert left.sigma == pytest.approx(sigma)
     assert (left.u, left.v, left.how) == (10.0, 20.0, how)
     assert float(read_marks(session.files.marks).sigmas(0.3)[0, 0]) == pytest.approx(sigma)
-    session.close()
-    again = Session(tmp_path / "marks.csv")
-    assert again.state == session.state
-    again.close()
+    kept(session).close()
 
 
 def test_names_of_targets_fill_the_list(tmp_path: Path, survey: Path) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bags import KINDS, START, Written, raw, write_bag
-from command_line import Command
+from command_line import Command, rows_of
 
 from kcal.capture.session import shots
 from kcal.errors import FileError, KcalWarning
@@ -81,14 +80,11 @@ def test_watching(tmp_path: Path, command: Command) -> None:
     found = []
     for k in range(2):
         one, stamp = pair(k + 1), START + k * 60 * 10**9
-        found += [
-            shot("/left/image", stamp, one.left, "mono8"),
-            shot("/right/image", stamp + 10**6, one.right, "mono8"),
-        ]
+        found.append(shot("/left/image", stamp, one.left, "mono8"))
+        found.append(shot("/right/image", stamp + 10**6, one.right, "mono8"))
     bag = write_bag(tmp_path / "run", "sqlite3", found)
     sides = [f"{bag}:/{side}/image" for side in ("left", "right")]
     command("watch", tmp_path / "rig.json", *sides, "-o", tmp_path / "h.csv")
-    with (tmp_path / "h.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "h.csv")
     assert [float(row["time"]) for row in rows] == [pytest.approx(1e-9 * START + 60.0 * k, abs=1e-3) for k in range(2)]
     assert float(rows[1]["relative_yaw_deg"]) == pytest.approx(0, abs=0.003)

@@ -214,12 +214,6 @@ class TestRefusals:
         found = ObjectDisparity(scene.rig)(scene.left, scene.right, scene.boxes, nowhere)
         assert int(found.status[0]) == MatchStatus.NO_RAY
 
-    def test_off_the_line(self) -> None:
-        scene = case(0, size=24, amplitude=0.0, box_sigma=0.0)
-        options = DisparityOptions(max_off_line=0.5)
-        found = ObjectDisparity(scene.rig, options)(scene.left, scene.right.roll(1, 0), scene.boxes, scene.aims)
-        self.check(found, MatchStatus.OFF_LINE)
-
 
 def test_gradients_to_both_images(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against differences, in the direction of the gradient and in random ones, at a constant scale of residuals."""
@@ -266,12 +260,6 @@ def test_range_of_an_object() -> None:
 def test_what_cannot_be_is_refused(changes: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         match(case(), **changes)
-
-
-@pytest.mark.parametrize("options", [{"search": 0.0}, {"min_score": 1.5}, {"max_sigma": 0.0}])
-def test_bad_options(options: dict) -> None:
-    with pytest.raises(InputError, match="disparity options"):
-        DisparityOptions(**options)
 
 
 # Where objects are refused, just within and just beyond each limit; what belongs to an object, and its steps.

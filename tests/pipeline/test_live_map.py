@@ -15,7 +15,7 @@ import orjson
 import pytest
 import torch
 from browser import chromium_page, names_on_a_map, needs_browser
-from track_scenes import ORIGIN, pairs_of, tracked_site
+from track_scenes import ORIGIN, pairs_of, run_of, tracked_site
 from waiting import PATIENCE, wait_for
 
 pytest.importorskip("uvicorn")
@@ -35,7 +35,7 @@ SITE = tracked_site()
 
 @pytest.fixture
 def page() -> Iterator[LiveMap]:
-    live = LiveMap(PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located(), 0)
+    live = LiveMap(run_of(SITE), 0)
     yield live
     live.close()
 
@@ -230,7 +230,7 @@ def test_names_cover_neither_each_other_nor_dots(width: int, height: int) -> Non
 
 
 def serve(answer: Any) -> None:
-    page = LiveMap(PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located(), 0)
+    page = LiveMap(run_of(SITE), 0)
     answer.send(page.address)
     answer.recv()
 

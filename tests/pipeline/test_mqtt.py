@@ -10,11 +10,10 @@ import numpy as np
 import orjson
 import pytest
 from ports import deaf_port
-from track_scenes import tracked_site
+from track_scenes import run_of, tracked_site
 
 pytest.importorskip("paho.mqtt.client")
-from kcal import InputError, Localizer
-from kcal.locate.points import PointLocator
+from kcal import InputError
 from kcal.locate.tables import NUMBERS, PositionColumns
 from kcal.pipeline.senders import Sender, sender_to
 
@@ -53,15 +52,13 @@ class Broker(threading.Thread):
 
 def sent_to(broker: Broker) -> Sender:
     """A sender that sent two tracks and was closed at once."""
-    site = tracked_site()
     sender = sender_to(f"mqtt://127.0.0.1:{broker.port}/site/tracks")
     numbers = np.full((2, len(NUMBERS)), np.nan)
     numbers[:, :3] = 19.0, 72.0, 5.0
     columns = PositionColumns(
         ["track 1", "track 2"], np.zeros(2, np.int8), ["", ""], numbers, {"sequence": ["9", "9"]}, np.zeros(2, int)
     )
-    run = PointLocator(Localizer(site.rig.placed(origin=site.origin, heading_deg=0.0))).located()
-    sender.send(columns, run, datetime.datetime.now(datetime.UTC))
+    sender.send(columns, run_of(tracked_site()), datetime.datetime.now(datetime.UTC))
     sender.close()
     broker.join()
     return sender

@@ -14,14 +14,12 @@ from pathlib import Path
 
 import pytest
 from ports import free_port
-from track_scenes import tracked_site
+from track_scenes import run_of, tracked_site
 from waiting import PATIENCE, wait_for
 
 pytest.importorskip("uvicorn")
 import httpx
 
-from kcal.locate.localizer import Localizer
-from kcal.locate.points import PointLocator
 from kcal.pipeline.senders import LiveMap
 
 NGINX, OPENSSL = (shutil.which(name, path="/usr/sbin:/usr/bin:/usr/local/bin") for name in ("nginx", "openssl"))
@@ -32,8 +30,7 @@ pytestmark = pytest.mark.skipif(not (NGINX and OPENSSL), reason="nginx and opens
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[tuple[str, str]]:
     """The address of the web server, and the token of the map behind it."""
-    site = tracked_site()
-    live = LiveMap(PointLocator(Localizer(site.rig.placed(origin=site.origin, heading_deg=0.0))).located(), 0)
+    live = LiveMap(run_of(tracked_site()), 0)
     port = re.search(r":(\d+)/#", live.address).group(1)
     command = [OPENSSL, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-subj", "/CN=map.example.org", "-days", "2"]
     subprocess.run([*command, "-keyout", "map.key", "-out", "map.crt"], cwd=tmp_path, check=True, capture_output=True)

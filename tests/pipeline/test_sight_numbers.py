@@ -54,6 +54,12 @@ def sights(bending: float = 0.0, turned: float = 0.0, seed: int = 0) -> StationS
     )
 
 
+def two_sights(ray: NDArray[np.float64], center: NDArray[np.float64], sigma: float) -> StationSights:
+    """One line of sight of each of two cameras."""
+    up = np.array([[0.0, 0.0, 1.0]] * 2)
+    return StationSights(np.array([0, 1]), ray, np.full(2, sigma), np.zeros(2), 0.0, center, up, 0.0)
+
+
 def confirming(lines: StationSights, gate: float = 4.0, near: float = 2.0, inner: float = -1.0) -> Confirming:
     axis = np.array([2500.0, 2500.0, 300.0]) - CENTER
     axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
@@ -128,9 +134,7 @@ class TestPencils:
             turn = share * math.hypot(0.01, 0.01)
             ray = np.array([[0.0, 1.0, 0.0], [-math.sin(turn), math.cos(turn), 0.0]])
             shift = np.array([[0.0, 0.0, 0.0], [100.0 * math.sin(turn), 100.0 * (1.0 - math.cos(turn)), 0.0]])
-            two = StationSights(
-                np.array([0, 1]), ray, np.full(2, 0.01), np.zeros(2), 0.0, shift, np.array([[0.0, 0, 1]] * 2), 0.0
-            )
+            two = two_sights(ray, shift, 0.01)
             assert (len(meetings(two, np.array([0]), np.array([1]), 4.0, 10.0).first) == 1) is known
 
     def test_behind_and_far_beyond_is_no_meeting(self) -> None:
@@ -141,10 +145,7 @@ class TestPencils:
             ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
             if behind is not None:
                 ray[behind] *= -1.0
-            lines = StationSights(
-                np.array([0, 1]), ray, np.full(2, 1e-6), np.zeros(2), 0.0, center, np.array([[0.0, 0, 1]] * 2), 0.0
-            )
-            return len(meetings(lines, np.array([0]), np.array([1]), 4.0, 100.0).first)
+            return len(meetings(two_sights(ray, center, 1e-6), np.array([0]), np.array([1]), 4.0, 100.0).first)
 
         assert count((200.0, 900.0)) == 1
         assert count((200.0, 900.0), 0) == count((200.0, 900.0), 1) == 0
@@ -407,9 +408,7 @@ def test_how_far_two_lines_pass() -> None:
     """Rays of σ 1 mrad from two stations pass 3 m apart at 800 and 1000 m: 9 / (.8² + 1²) variances."""
     ray = np.array([[0.0, 1.0, 0.0], [-0.6, 0.8, 0.003]])
     center = np.array([[0.0, 0.0, 0.0], [600.0, 0.0, 0.0]])
-    lines = StationSights(
-        np.array([0, 1]), ray, np.full(2, 1e-3), np.zeros(2), 0.0, center, np.array([[0.0, 0.0, 1.0]] * 2), 0.0
-    )
+    lines = two_sights(ray, center, 1e-3)
     found = meetings(lines, np.array([0]), np.array([1]), 4.0, 100.0)
     assert found.squared.tolist() == pytest.approx([9.0 / 1.64], rel=0.01)
     # Nearer to the line that is known better there.

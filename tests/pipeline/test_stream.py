@@ -23,12 +23,11 @@ import orjson
 import pytest
 import torch
 from ports import deaf_port
-from track_scenes import seen_by, tracked_site
+from track_scenes import run_of, seen_by, tracked_site
 from waiting import PATIENCE
 
 import kcal.pipeline.stream
-from kcal import FileError, InputError, Localizer
-from kcal.locate.points import PointLocator
+from kcal import FileError, InputError
 from kcal.pipeline.grouping import Moment, read_moment
 from kcal.pipeline.senders import CotSender, sender_to
 from kcal.pipeline.stream import Ledger, MomentOrder, SourceItem, Stream, StreamCounts, lines_of
@@ -62,10 +61,9 @@ def read(line: bytes) -> Moment:
 
 
 def new_stream(folder: Path, **options: object) -> Stream:
-    run = PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located()
     tracker = Tracker(SITE, clock=ClockPrior(offset_sigma_s=0.02))
     outputs = [folder / "tracks.geojsonl", folder / "tracks.csv", folder / "tracks.cot"]
-    return Stream(tracker, run, outputs, folder / "journal", **options)  # type: ignore[arg-type]
+    return Stream(tracker, run_of(SITE), outputs, folder / "journal", **options)  # type: ignore[arg-type]
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -213,8 +211,11 @@ class _Slow:
 
 def test_a_journal_of_something_else(whole: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
     new_stream(tmp_path).follow(lines_of(whole[0], read), waits=True, resumes=True)
-    run = PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located()
-    outputs = [tmp_path / "tracks.geojsonl", tmp_path / "tracks.csv", tmp_path / "tracks.cot"]
+    other = tmp_path / "other.jsonl"
+    other.write_bytes(b"{}\n")
+    with pytest.raises(FileError, match="shorter than the journal says"):
+        new_stream(tmp_path).follow(lines_of(other, read), waits=True, resumes=True)
+    run, outputs = run_of(SITE), [tmp_path / "tracks.geojsonl", tmp_path / "tracks.csv", tmp_path / "tracks.cot"]
     with pytest.raises(FileError, match="other outputs"):
         Stream(Tracker(SITE), run, outputs[:1], tmp_path / "journal")
     with pytest.raises(FileError, match="another rig or other options"):
@@ -245,14 +246,6 @@ def test_a_journal_of_damaged_places(place: list[object], tmp_path: Path) -> Non
     assert output.read_bytes() == b"abc"
     journal.write_bytes(whole)
     Ledger(journal, [output]).close()
-
-
-def test_a_shorter_input(whole: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
-    new_stream(tmp_path).follow(lines_of(whole[0], read), waits=True, resumes=True)
-    other = tmp_path / "other.jsonl"
-    other.write_bytes(b"{}\n")
-    with pytest.raises(FileError, match="shorter than the journal says"):
-        new_stream(tmp_path).follow(lines_of(other, read), waits=True, resumes=True)
 
 
 def test_a_source_that_fails_ends_the_stream(whole: tuple[Path, dict[str, bytes]], tmp_path: Path) -> None:
@@ -324,10 +317,8 @@ def test_impossible_addresses(wrong: str) -> None:
 
 
 def test_outputs_that_cannot_grow(tmp_path: Path) -> None:
-    run = PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located()
     with pytest.raises(InputError, match="output of a stream"):
-        Stream(Tracker(SITE), run, [tmp_path / "a.kml"],
-               tmp_path / "journal")  # fmt: skip
+        Stream(Tracker(SITE), run_of(SITE), [tmp_path / "a.kml"], tmp_path / "journal")
 
 
 # Times that are wrong, clocks that are set, and two streams that write one file.
@@ -343,8 +334,7 @@ def line_at(seen_s: float, stamp: float) -> bytes:
 
 
 def new_timed_stream(folder: Path) -> Stream:
-    run = PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located()
-    return Stream(Tracker(SITE), run, [folder / "tracks.csv"], folder / "journal")
+    return Stream(Tracker(SITE), run_of(SITE), [folder / "tracks.csv"], folder / "journal")
 
 
 def follow(folder: Path, stamps: list[float], name: str = "lines.jsonl") -> StreamCounts:
@@ -472,16 +462,9 @@ def test_one_process_at_a_time_writes_an_output(tmp_path: Path) -> None:
         assert child.stdout.readline() == b"ready\n"
         for journal in ("journal", "other"):
             with pytest.raises(FileError, match=rf"tracks\.csv: kcal live, process {child.pid}, since 20.* writes it"):
-                Stream(
-                    Tracker(SITE),
-                    PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located(),
-                    [tmp_path / "tracks.csv"], tmp_path / journal,
-                )  # fmt: skip
+                Stream(Tracker(SITE), run_of(SITE), [tmp_path / "tracks.csv"], tmp_path / journal)
         with pytest.raises(FileError, match=r"journal: kcal live, process"):
-            Stream(
-                Tracker(SITE), PointLocator(Localizer(SITE.rig.placed(origin=SITE.origin, heading_deg=0.0))).located(),
-                [tmp_path / "other.csv"], tmp_path / "journal",
-            )  # fmt: skip
+            Stream(Tracker(SITE), run_of(SITE), [tmp_path / "other.csv"], tmp_path / "journal")
         assert (tmp_path / "tracks.csv").read_bytes() == b"row\n"
     finally:
         child.send_signal(signal.SIGKILL)
@@ -498,21 +481,7 @@ def test_a_line_with_anything_is_a_moment_or_an_input_error() -> None:
         {side: {"time": 3.5, "boxes": [[900, 500, 920, 520]], "scores": [0.5], "categories": ["a"]}
          for side in ("left", "right")},
     ]  # fmt: skip
-    odd = [
-        "1e308",
-        "1e-308",
-        "-1",
-        str(2**64),
-        "9" * 400,
-        "null",
-        "true",
-        '"x"',
-        "[]",
-        "{}",
-        "[[1]]",
-        "NaN",
-        "[" * 3000,
-    ]
+    odd = f'1e308 1e-308 -1 {2**64} {"9" * 400} null true "x" [] {{}} [[1]] NaN {"[" * 3000}'.split()
     tracker, counts = Tracker(SITE), {True: 0, False: 0}
     for line in good:
         for path in _paths(line):

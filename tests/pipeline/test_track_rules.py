@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -133,9 +132,6 @@ class TestRules:
             told = scene.tracker(dataclasses.replace(pairs, category=(name,), score=torch.tensor([score])))
         assert told.category == ("ship",)
         assert scene.tracker.records[0].categories == pytest.approx({"car": 1.0, "ship": 1.1})
-
-    def test_a_third_of_what_compression_adds_lasts(self) -> None:
-        assert TrackOptions.for_video(0.03).lasting_px == pytest.approx(math.hypot(0.01, 0.01))
 
     def test_gates_lose_as_many_of_any_number_of_cameras(self) -> None:
         gates = Tracker(tracked_site(), dataclasses.replace(SLOW, gate=20.0)).gates

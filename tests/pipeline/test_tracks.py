@@ -205,17 +205,11 @@ def test_models_find_out_how_a_target_moves() -> None:
     rate, speed = 0.2, 12.0
     for frame in range(60):
         time = frame / 10.0
-        turning = [
-            -30.0 + speed / rate * math.sin(rate * time),
-            0.0,
-            150.0 + speed / rate * (1 - math.cos(rate * time)),
-        ]
+        east, ahead = speed / rate * math.sin(rate * time), speed / rate * (1 - math.cos(rate * time))
+        turning = [east - 30.0, 0.0, ahead + 150.0]
         places = torch.tensor([turning, [20.0, 0.0, 150.0], [-60.0 + 10 * time, -10.0, 200.0]]).double()
         tracks = tracker(pairs_of(*seen_by(localize.rig, places, 0.3, generator), time))
-    best = tracks.models.argmax(-1).tolist()
-    assert best[0] == 2
-    assert best[1] == 0
-    assert best[2] == 1
+    assert tracks.models.argmax(-1).tolist() == [2, 0, 1]
     assert torch.allclose(tracks.models.sum(-1), torch.ones(3).double())
 
 

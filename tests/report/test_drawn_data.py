@@ -10,13 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from drawn_scenes import (
-    calibrated,
-    landmarks_rig,
-    night,
-    sites,
-    watched,
-)
+from drawn_scenes import calibrated, landmarks_rig, night, sites, watched
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver, QuiverKey
@@ -29,13 +23,7 @@ from kcal.locate.siting import Site, siting_map
 from kcal.report import positions as siting_module
 from kcal.report.calibration import camera_pictures, difference_figure
 from kcal.report.figures import draw_arrows
-from kcal.report.positions import (
-    _siting_marks,
-    _siting_notes,
-    budget_figure,
-    range_picture,
-    siting_figure,
-)
+from kcal.report.positions import _siting_marks, _siting_notes, budget_figure, range_picture, siting_figure
 from kcal.report.rig import _above_sky, _edges, attitude_figure, rig_figure, stars_figure
 from kcal.report.verdict import RangeAnswer, Requirement
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
 import math
@@ -155,6 +156,12 @@ class TestScores:
         assert gate["range_off_m"] == pytest.approx(-5.0)
         assert table.cells[1:] == [["MAST", "300", "1", "+10", "yes"], ["gate ", "500", "5", "-5", "no"]]
         assert len(located_rows(path, truth)) == 3
+        table_file, known = tmp_path / "a.csv", [one["properties"] for one in json.loads(path.read_text())["features"]]
+        with table_file.open("w", newline="") as out:
+            writer = csv.DictWriter(out, known[0])
+            writer.writeheader()
+            writer.writerows(known)
+        assert score_positions(table_file, truth).records == table.records
         lines = tmp_path / "a.geojsonl"
         lines.write_text("\n".join(json.dumps(one) for one in json.loads(path.read_text())["features"]))
         assert located_rows(lines, truth)[1].range_high_m == math.inf

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from browser import at_rest, chromium_page, needs_browser
+from drawn_scenes import PLACES
 from locate_rigs import located_pairs, pinhole_rig, tensor
 from PIL import Image, TiffImagePlugin
 from waiting import wait_for
@@ -22,16 +23,15 @@ from kcal.locate.positions import Located
 from kcal.report.map_page import local_image, local_tiles, map_page, save_map
 
 ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
-TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])
 
 
 def scene(origin: Origin = ORIGIN) -> tuple[Located, torch.Tensor]:
-    left, right = pinhole_rig()(TRUTH)[0].unbind(-2)
+    left, right = pinhole_rig()(PLACES)[0].unbind(-2)
     names = ["gate", "</script><b>mast", "ship", "cloud"]
     located = located_pairs(
         pinhole_rig(), left, right + tensor([0.3, 0.0]), origin=origin, heading_deg=300.0, names=names
     )
-    return located, TRUTH @ enu_from_cam(300.0).T
+    return located, PLACES @ enu_from_cam(300.0).T
 
 
 def data(page: str) -> dict[str, object]:
@@ -104,13 +104,13 @@ HOSTILE = (
 
 @needs_browser
 def test_names_are_texts_in_a_browser(tmp_path: Path) -> None:
-    left, right = pinhole_rig()(TRUTH)[0].unbind(-2)
+    left, right = pinhole_rig()(PLACES)[0].unbind(-2)
     located = located_pairs(pinhole_rig(), left, right, origin=ORIGIN, heading_deg=300.0, names=list(HOSTILE))
     tiles = tmp_path / HOSTILE[1]
     (tiles / "13" / "5754").mkdir(parents=True)
     Image.new("RGB", (256, 256), "green").save(tiles / "13" / "5754" / "3654.png")
     image = geotiff(tmp_path / f"{HOSTILE[2]}.tif")
-    drawn = dom(save_map(tmp_path / "map.html", located, TRUTH, tiles=tiles, image=image))
+    drawn = dom(save_map(tmp_path / "map.html", located, PLACES, tiles=tiles, image=image))
     assert 'data-drawn="3/' in drawn
     assert "data-ran" not in drawn
     for name in HOSTILE[:3]:
@@ -277,7 +277,7 @@ def test_controls_cover_no_camera_and_no_point(tmp_path: Path, width: int, headi
 
 @pytest.mark.parametrize(("scale", "digits"), [(1.0, 6), (1e-3, 8)])
 def test_coordinates_have_the_digits_that_mean_something(scale: float, digits: int) -> None:
-    left, right = pinhole_rig(baseline=10.0 * scale)(TRUTH[:1] * scale)[0].unbind(-2)
+    left, right = pinhole_rig(baseline=10.0 * scale)(PLACES[:1] * scale)[0].unbind(-2)
     located = located_pairs(
         pinhole_rig(baseline=10.0 * scale), left, right, origin=ORIGIN, heading_deg=0.0, names=["a"]
     )

@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 import torch
+from calibrate_scenes import motions, observe, pixels_of
 from locate_rigs import located_pairs
 from PIL import Image
 from typer.testing import CliRunner
 
 import kcal
-from kcal import Board, CalibrationOptions, Camera, Landmarks, Observations, Origin, Rig, RigData, RigOptions, View
+from kcal import Board, CalibrationOptions, Camera, Landmarks, Observations, Origin, Rig, RigData, RigOptions
 from kcal.cli.main import app
-from kcal.lens import rotation_from_vector
 
 ROOT = Path(__file__).parents[2]
 NASTY = "<b>north & \x1b[2J$x^$"
@@ -69,16 +69,10 @@ def read(value: Any) -> Read:
 
 
 def observed(name: str = NASTY, blurred: bool = True) -> Observations:
-    board = Board(columns=7, rows=6, square=0.05)
-    tilts = torch.tensor([[0.5, 0, 0], [-0.5, 0.1, 1.5], [0, 0.5, 0.2], [0.1, -0.5, 0], [0.4, 0.4, -1.4]]).double()
-    noise, views = torch.Generator().manual_seed(4), []
-    for number, turn in enumerate(rotation_from_vector(tilts)):
-        points = (board.points - board.points.mean(0)) @ turn.T + torch.tensor([0, 0, 0.7]).double()
-        pixels = CAMERA.project(points)[0]
-        pixels = pixels + 0.05 * torch.randn(pixels.shape, generator=noise, dtype=pixels.dtype)
-        views.append(View(name=f"{name} {number}", pixels=pixels))
+    pixels = pixels_of(CAMERA, motions(CAMERA, 5, 4), noise=0.05)
+    seen = observe(pixels, size=CAMERA.size, names=[f"{name} {number}" for number in range(5)])
     failures = [{"name": name, "reason": "blurred"}] if blurred else []
-    return Observations(board=board, image_size=CAMERA.size, views=views, failures=failures)
+    return Observations(board=seen.board, image_size=CAMERA.size, views=seen.views, failures=failures)
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from drawn_scenes import PLACE, PLACES
 from locate_rigs import located_pairs, pinhole_rig, tensor
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from kcal import InputError, Origin
+from kcal import InputError
 from kcal.locate import enu_from_cam
 from kcal.locate.budget import RangeError
 from kcal.locate.positions import Located
@@ -18,24 +19,24 @@ from kcal.report.figures import new_figure, save_picture
 from kcal.report.positions import budget_figure, positions_figure
 
 HEADING = 300.0
-TRUTH = tensor([20.0, 0.0, 100.0], [-300.0, 5.0, 1000.0], [900.0, 0.0, 5000.0], [0.0, 0.0, 60_000.0])
+
+
+def along_a_line(count: int, names: list[str] | None = None) -> Located:
+    """Points from 80 m to 6 km."""
+    points = torch.linspace(80, 6000, count, dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
+    left, right = pinhole_rig()(points)[0].unbind(-2)
+    return located_pairs(pinhole_rig(), left, right, origin=PLACE, heading_deg=0.0, names=names)
 
 
 def scene() -> tuple[Located, torch.Tensor]:
     rig = pinhole_rig()
-    left, right = rig(TRUTH)[0].unbind(-2)
+    left, right = rig(PLACES)[0].unbind(-2)
     # One pair more, outside the image, of which the truth is not known.
     left, right = torch.cat([left, tensor([5000.0, 1.0])]), torch.cat([right, tensor([1.0, 1.0])])
     right = right + tensor([0.3, 0.0])
-    located = located_pairs(
-        rig,
-        left,
-        right,
-        origin=Origin(lat=10.0, lon=20.0, height=0.0),
-        heading_deg=HEADING,
-        names=["gate", "mast", "ship", "cloud", "lost"],
-    )
-    enu = torch.cat([TRUTH @ enu_from_cam(HEADING).T, torch.full((1, 3), math.nan)])
+    names = ["gate", "mast", "ship", "cloud", "lost"]
+    located = located_pairs(rig, left, right, origin=PLACE, heading_deg=HEADING, names=names)
+    enu = torch.cat([PLACES @ enu_from_cam(HEADING).T, torch.full((1, 3), math.nan)])
     return located, enu
 
 
@@ -74,11 +75,8 @@ def test_arrows_lead_from_truth_to_estimate_only_where_they_differ() -> None:
 
 @pytest.mark.parametrize(("count", "named"), [(40, True), (41, False)])
 def test_no_more_than_forty_points_have_names(count: int, named: bool) -> None:
-    points = torch.linspace(80, 6000, count, dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
-    left, right = pinhole_rig()(points)[0].unbind(-2)
     names = [f"p{i}" for i in range(count)]
-    origin = Origin(lat=10.0, lon=20.0, height=0.0)
-    figure = positions_figure(located_pairs(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=names))
+    figure = positions_figure(along_a_line(count, names))
     assert ("p7" in [text.get_text() for text in figure.axes[0].texts]) is named
     rows = [text.get_text().split()[0] for text in figure.axes[1].get_yticklabels()]
     assert rows == (names if named else [])
@@ -86,18 +84,14 @@ def test_no_more_than_forty_points_have_names(count: int, named: bool) -> None:
 
 @pytest.mark.parametrize("count", [1, 60])
 def test_one_point_and_many_points(tmp_path: Path, count: int) -> None:
-    rig = pinhole_rig()
-    points = torch.linspace(80, 6000, count, dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
-    left, right = rig(points)[0].unbind(-2)
-    located = located_pairs(rig, left, right, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
-    path = save_picture(tmp_path / "map.png", positions_figure(located))
+    path = save_picture(tmp_path / "map.png", positions_figure(along_a_line(count)))
     assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_nothing_to_draw_is_drawn_all_the_same(tmp_path: Path) -> None:
     rig, marks = pinhole_rig(), tensor([5000.0, 1.0])
-    located = located_pairs(rig, marks, marks, origin=Origin(lat=10.0, lon=20.0, height=0.0), heading_deg=0.0)
+    located = located_pairs(rig, marks, marks, origin=PLACE, heading_deg=0.0)
     assert save_picture(tmp_path / "map.png", positions_figure(located)).stat().st_size > 10_000
 
 
@@ -123,10 +117,7 @@ HOSTILE = (
 
 
 def test_names_are_drawn_as_they_are(tmp_path: Path) -> None:
-    points = torch.linspace(80, 6000, len(HOSTILE), dtype=torch.float64)[:, None] * tensor([0.1, 0.0, 1.0])
-    left, right = pinhole_rig()(points)[0].unbind(-2)
-    origin = Origin(lat=10.0, lon=20.0, height=0.0)
-    located = located_pairs(pinhole_rig(), left, right, origin=origin, heading_deg=0.0, names=list(HOSTILE))
+    located = along_a_line(len(HOSTILE), list(HOSTILE))
     save_picture(tmp_path / "map.png", positions_figure(located))
     figure = positions_figure(located)
     figure.canvas.draw()

@@ -4,28 +4,26 @@ from __future__ import annotations
 
 import functools
 import itertools
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from calibrate_scenes import BOARD, camera, motions
+from calibrate_scenes import BOARD
 from drawn_scenes import FIGURES, boxes, calibrated, landmarks_rig, sites
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver, QuiverKey
 
-from kcal import Board, Camera, InputError, Observations, View
+from kcal import Board, Camera, Observations
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.export import Misfit
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, board_text
 from kcal.lens import camera_difference
 from kcal.locate.siting import siting_map
-from kcal.report import rig_figure, save_picture
+from kcal.report import rig_figure
 from kcal.report.calibration import (
-    board_figure,
     calibration_figure,
     coverage_figure,
     difference_figure,
@@ -41,16 +39,8 @@ LONG = "/home/somebody/a long folder of a site/with the date 2026-11-24/and more
 
 
 def observed(count: int = 8) -> Observations:
-    truth = camera("opencv4")
-    rotation, translation = motions(truth, count, 3)
-    pixels, _ = truth.project(BOARD.points @ rotation.transpose(-1, -2) + translation[:, None])
-    noise = 0.05 * torch.randn(pixels.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    spread = tuple((0.01, 0.0, 0.01) for _ in range(BOARD.corners))
-    views = [
-        View(name=f"{i:02}.png", pixels=tuple(map(tuple, view)), covariance=spread)
-        for i, view in enumerate((pixels + noise).tolist())
-    ]
-    return Observations(board=BOARD, image_size=(640, 480), views=tuple(views))
+    seen, spread = calibrated().observations, {"covariance": ((0.01, 0.0, 0.01),) * BOARD.corners}
+    return seen.model_copy(update={"views": tuple(view.model_copy(update=spread) for view in seen.views[:count])})
 
 
 def widths(figure: Figure) -> list[float]:
@@ -131,13 +121,6 @@ def test_text_of_a_flat_board() -> None:
     lines = board_text(bent_board(0.0))
     assert lines[0].startswith("bending 0.000 ± 0.0")
     assert [line.split()[0] for line in lines] == ["bending", "stretch", "shear", "print"]
-
-
-def test_file(tmp_path: Path) -> None:
-    path = save_picture(tmp_path / "board.png", board_figure(bent_board(0.0)))
-    assert path.read_bytes()[:4] == b"\x89PNG"
-    with pytest.raises(InputError, match=r"must end with \.png"):
-        save_picture(tmp_path / "board.jpg", board_figure(bent_board(0.0)))
 
 
 # Every picture: nothing is cut, nothing covers another thing, nothing is lost in a corner.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -46,15 +47,8 @@ def solved(left: CalibrationRecord, right: CalibrationRecord | None = None, **ch
     size = rig.left.params.shape[-1]
     spread = torch.cat([torch.full((2 * size,), 1e-2), torch.full((6,), 1e-6)]).double()
     rig.covariance = RigCovariance.of(rig, joint=torch.diag(spread.square()))
-    rig.calibration = RigCalibration(
-        rms=0.1,
-        rms_px=(0.1, 0.1),
-        pairs=0,
-        per_pair_rms={},
-        kcal_version="1",
-        created=NOW,
-        **changes,  # type: ignore[arg-type]
-    )
+    known: Any = {"rms": 0.1, "rms_px": (0.1, 0.1), "pairs": 0, "per_pair_rms": {}, "kcal_version": "1", "created": NOW}
+    rig.calibration = RigCalibration(**known, **changes)
     return rig
 
 
