@@ -283,7 +283,10 @@ def read_storage(data: bytes, source: str) -> dict[str, Any]:
         text = data.decode("utf-8-sig")
         start = text.lstrip()[:1]
         if start == "<":
-            found = _from_xml(read_xml(text, source))
+            root = read_xml(text, source)
+            if root.tag != "opencv_storage":
+                raise ValueError(f"the root element is {root.tag[:40]!r}, not opencv_storage")
+            found = _of_element(root)
         else:
             found = _plain(read_json(data, source)) if start == "{" else _from_yaml(text)
     except (ValueError, OverflowError) as error:
@@ -333,12 +336,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, str):
         return _SPECIAL.get(value.lower(), value)
     return float(value) if isinstance(value, int | float) else str(value)
-
-
-def _from_xml(root: Element) -> Any:
-    if root.tag != "opencv_storage":
-        raise ValueError(f"the root element is {root.tag[:40]!r}, not opencv_storage")
-    return _of_element(root)
 
 
 def _of_element(element: Element) -> Any:

@@ -12,7 +12,7 @@ import orjson
 
 import kcal
 from kcal.cli import kinds, rooms
-from kcal.cli.console import out, print_table, print_wrote, steps, tell, tell_table, warn
+from kcal.cli.console import draw_picture, out, print_table, print_wrote, steps, tell, tell_table, warn
 from kcal.cli.inputs import cameras_and_rig, named_source, picked, single_camera
 from kcal.cli.options import Kind, Several
 from kcal.errors import InputError
@@ -75,8 +75,7 @@ def export_command(
         if misfit is None:
             out.print(f"{label}, {'baked' if done.format == 'remap' else 'exact'}")
         else:
-            text = f"{label}, fitted: RMS {misfit.rms:.2g} px, at most {misfit.largest:.2g} px over the image"
-            out.print(text)
+            out.print(f"{label}, fitted: RMS {misfit.rms:.2g} px, at most {misfit.largest:.2g} px over the image")
             if misfit.rms > _FAR:
                 warn(
                     f"{camera or 'camera'}: no lens model of {done.format} comes nearer; mrcal files (.cameramodel) "
@@ -256,8 +255,7 @@ def compare_command(
     tell_table("models", table)
     if output is not None:
         write_atomic(output, table.csv)
-    if picture is not None:
-        kcal.report.save_picture(picture, rooms.models_figure(result, observations.name))
+    draw_picture(picture, lambda: rooms.models_figure(result, observations.name))
     print_wrote(output, picture)
     for name, reason in result.failures.items():
         warn(f"{name} could not be fitted to some of the views: {reason}")

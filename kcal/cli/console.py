@@ -103,6 +103,12 @@ def print_wrote(*paths: Path | None) -> None:
             out.print(f"{'replaced' if replaced(path) else 'wrote'} {path}")
 
 
+def draw_picture(path: Path | None, figure: Callable[[], Any]) -> None:
+    """Draw and save a picture, if one was asked for."""
+    if path is not None:
+        kcal.report.save_picture(path, figure())
+
+
 def print_replaced(written: Mapping[Path, bool]) -> None:
     """Name on the error stream the files that were replaced and of which nothing was said."""
     said = told.get("wrote", ())

@@ -215,8 +215,7 @@ Raster = Annotated[Path, Kind(metavar="RASTER")]
 
 
 def _read_picture(text: str, name: str) -> Path:
-    check_picture(text)
-    return Path(text)
+    return check_picture(text)
 
 
 Output = Annotated[Path, Kind(flags=("-o", "--output"))]

@@ -319,12 +319,7 @@ def _declared_options(
             yield from _declared_options(fields, about | described(plain.__doc__)[1], each.name)
             continue
         kinds = [one for one in more if isinstance(one, Kind)]
-        told = {
-            field.name: value
-            for kind in kinds
-            for field in dataclasses.fields(Kind)
-            if (value := getattr(kind, field.name)) != field.default
-        }
+        told = {name: value for one in kinds for name, value in vars(one).items() if value != getattr(Kind, name)}
         kind = Kind(**told)
         yield _Option(
             name=each.name, type=plain, kind=kind, group=group,
@@ -462,11 +457,7 @@ class Command(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; what it takes from kcal.toml is said first, in one line."""
-        names = [
-            param.name
-            for param in self.params
-            if getattr(ctx.get_parameter_source(param.name), "name", "") == "DEFAULT_MAP"
-        ]
+        names = [one.name for one in self.params if "DEFAULT_MAP" in repr(ctx.get_parameter_source(one.name))]
         taken.clear()
         taken.update(names)
         if names:

@@ -102,8 +102,7 @@ def print_rig(result: rooms.RigResult, lines: list[str]) -> None:
     for line in lines:
         print_styled(line, r"(?<=^RMS )\S+ px|(?<=^baseline ).+")
     for turned in result.flipped:
-        text = f"turned by 180°: {turned.board} ({turned.camera}; the board was read from its other end)"
-        out.print(text)
+        out.print(f"turned by 180°: {turned.board} ({turned.camera}; the board was read from its other end)")
     for source in dict.fromkeys(item.source for item in result.left_out):
         gone = [item for item in result.left_out if item.source == source]
         for item in gone[:_MOST_NAMED]:
@@ -174,8 +173,7 @@ def solve_and_write(
     tell(rms_px=result.rms, warnings=console.told.get("warnings", []), left_out=left_out)
     print_rig(result, [*lines, *read.told(result)])
     kcal.save_rig(rig, output)
-    if picture is not None:
-        kcal.report.save_picture(picture, kcal.report.rig_figure(result))
+    console.draw_picture(picture, lambda: kcal.report.rig_figure(result))
     if two:
         baseline = float(rig.baseline)
         tell(baseline_m=baseline, baseline_sigma_m=result.sigma_baseline, pairs=list(result.pairs))
@@ -491,7 +489,9 @@ def rig_check_command(
     surveyed = None if landmarks is None else _landmarks(old, landmarks, now, noise)
     drift = kcal.rig.check_rig(old, features=features, landmarks=surveyed)
     print_turns(drift, f"{sum(item.used for item in drift.items)} of {len(drift.items)}")
-    _print_effect(drift)
+    for distance, found, sigma in zip(*(value.tolist() for value in drift.effect()), strict=True):
+        shift = "infinity" if math.isinf(found) else f"{found:.1f} m ({found - distance:+z.1f} ± {sigma:.1f} m)"
+        out.print(f"with the old rig a target at {distance:g} m is found at {shift}")
     for item in drift.left_out:
         print_label("left out", f"{item.name}: {item.reason}")
     if drift.variance > 1:
@@ -526,12 +526,6 @@ def print_turns(drift: rooms.Drift, used: str = "") -> None:
         cells = [f"{math.degrees(value):+z.5f} ± {math.degrees(sigma):.5f}" for value, sigma in both]
         rows.append([name, *cells, *([used] if used else [])])
     print_table(rows, left=range(len(rows[0])))
-
-
-def _print_effect(drift: rooms.Drift) -> None:
-    for distance, found, sigma in zip(*(value.tolist() for value in drift.effect()), strict=True):
-        shift = "infinity" if math.isinf(found) else f"{found:.1f} m ({found - distance:+z.1f} ± {sigma:.1f} m)"
-        out.print(f"with the old rig a target at {distance:g} m is found at {shift}")
 
 
 def now_stamp() -> str:

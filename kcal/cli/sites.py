@@ -9,7 +9,7 @@ from typing import Annotated
 
 import kcal
 from kcal.cli import kinds, rooms
-from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.console import draw_picture, out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_of
 from kcal.cli.options import Kind
 from kcal.cli.stars import print_star_budget
@@ -100,8 +100,7 @@ def sites_command(
         out.print(f"with the chosen: {length_text(later.mean_sigma, digits=3)}, {100 * later.covered:.0f} % covered")
     if output is not None:
         write_atomic(output, _map_text(field, now, later))
-    if picture is not None:
-        kcal.report.save_picture(picture, rooms.siting_figure(field, standing, ranked))
+    draw_picture(picture, lambda: rooms.siting_figure(field, standing, ranked))
     print_wrote(output, picture)
 
 

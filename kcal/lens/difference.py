@@ -11,6 +11,7 @@ from torch import Tensor
 from kcal.checks import chi2_tail
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
+from kcal.lens.information import CameraInformation
 from kcal.lens.pose import fit_turn, rotation_between, seen_turned
 from kcal.lens.projection import FAR
 from kcal.lens.uncertainty import largest_sigma, pixel_covariance, pixel_slopes
@@ -167,7 +168,7 @@ def camera_difference(
         pixels=pixels,
         shift=away.reshape(pixels.shape),
         sigma=None if sigma is None else sigma.reshape(pixels.shape[:2]),
-        known=(_has_errors(first), _has_errors(second)),
+        known=(_errors(first) is not None, _errors(second) is not None),
         rotation=turn,
         translation=shift,
         at=at,
@@ -176,16 +177,16 @@ def camera_difference(
     )
 
 
-def _has_errors(camera: Camera) -> bool:
+def _errors(camera: Camera) -> CameraInformation | None:
     known = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
-    return known is not None and known.lens_size > 0
+    return known if known is not None and known.lens_size > 0 else None
 
 
 def _inverse_variances(first: Camera, second: Camera, pixels: Tensor, good: Tensor) -> Tensor:
     """(N,) inverse variances with mean one, zero where a camera has no ray."""
     variance = torch.zeros_like(pixels[:, 0])
     for camera in (first, second):
-        if _has_errors(camera):
+        if _errors(camera) is not None:
             variance = variance + 0.5 * pixel_covariance(camera, pixels).diagonal(dim1=-2, dim2=-1).sum(-1)
     good = good & variance.isfinite()
     typical = torch.maximum(variance[good].median(), 1e-6 * variance[good].max())
@@ -226,11 +227,8 @@ def _judged(
     roots = []
     root = weight.sqrt()[:, None, None]
     for camera, here in zip((first, second), places, strict=True):
-        if not _has_errors(camera):
+        if (known := _errors(camera)) is None:
             continue
-        assert camera.calibration is not None
-        known = camera.calibration.known(camera.params.detach())
-        assert known is not None
         wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
         by_camera, by_motion, good = pixel_slopes(camera, here, at, wanted)
         by_camera = torch.where(good[:, None, None], by_camera, 0.0)

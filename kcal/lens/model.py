@@ -536,7 +536,7 @@ def distort_components(
             a, e = torch.add(a + shear, p2x, alpha=4.0), torch.add(e + shear, p1y, alpha=4.0)
             point = (a, b + turn, d + turn, e)
 
-    columns = _coefficient_columns(x, y, s, xx, xy, yy, g, inverse, model, wanted)
+    columns = _coefficient_columns((x, y, s, xx, xy, yy), g, inverse, model, wanted)
     if not model.tilt:
         return Distorted(u, v, point, as_columns([pair for pair in columns if pair is not None], u), positive)
 
@@ -580,20 +580,12 @@ def as_columns(pairs: Sequence[tuple[Tensor, Tensor]], like: Tensor) -> Tensor:
 
 
 def _coefficient_columns(
-    x: Tensor,
-    y: Tensor,
-    s: Tensor,
-    xx: Tensor,
-    xy: Tensor,
-    yy: Tensor,
-    g: Tensor,
-    inverse: Tensor,
-    model: LensModel,
-    wanted: Sequence[int],
+    plane: tuple[Tensor, ...], g: Tensor, inverse: Tensor, model: LensModel, wanted: Sequence[int]
 ) -> list[tuple[Tensor, Tensor] | None]:
-    """Derivatives by the wanted coefficients, before the tilt; None stands for a tilt angle."""
+    """Derivatives by the wanted coefficients at x, y with their products, before the tilt; None: a tilt angle."""
     if not wanted:
         return []
+    x, y, s, xx, xy, yy = plane
     powers = [s]
     while len(powers) < max(model.numerator, model.denominator, model.prism):
         powers.append(powers[-1] * s)

@@ -255,9 +255,10 @@ def _depth_and_slope(square: Tensor, coefficients: Tensor, port: bool) -> tuple[
     return (first + (second + third * square) * square) * square, slope
 
 
-def about_axis(
-    X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, port: bool
-) -> tuple[Tensor, Tensor, tuple[Tensor, ...] | None]:
+_About = tuple[Tensor, Tensor, tuple[Tensor, ...] | None]
+
+
+def about_axis(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, port: bool) -> _About:
     """ρ² of points (..., N) and their distance along the axis, and `Pupil.axis`, for a hybrid lens (..., P)."""
     if not port:
         return X * X + Y * Y, Z, None
@@ -278,11 +279,11 @@ def ray_starts(
 
     Two of Newton's steps are in the autograd graph; at a solution these have its exact first and second derivatives.
     """
-    across, ahead, axis = about_axis(X, Y, Z, coefficients, port)
+    about = about_axis(X, Y, Z, coefficients, port)
     with torch.no_grad():
-        depth = torch.zeros_like(ahead)
+        depth = torch.zeros_like(about[1])
         for _ in range(_STEPS):
-            wanted, pupil = _pupil_at(across, ahead, coefficients, depth, meter, axis)
+            wanted, pupil = _pupil_at(about, coefficients, depth, meter)
             step = (wanted - depth) * pupil.gain
             depth = depth + step
             found = pupil.found & (step * step <= _LAST_STEP**2 * (X * X + Y * Y + Z * Z))
@@ -290,7 +291,7 @@ def ray_starts(
                 break
     if is_differentiated(X, Y, Z, coefficients, meter if isinstance(meter, Tensor) else None):
         for _ in range(2):
-            wanted, pupil = _pupil_at(across, ahead, coefficients, depth, meter, axis)
+            wanted, pupil = _pupil_at(about, coefficients, depth, meter)
             depth = depth + (wanted - depth) * pupil.gain
     return pupil._replace(depth=depth, found=found)
 
@@ -310,19 +311,13 @@ def entrance_pupil(
 ) -> Pupil:
     """As `ray_starts`, with what closed-form derivatives need."""
     found = ray_starts(X, Y, Z, coefficients, meter, port=port)
-    across, ahead, axis = about_axis(X, Y, Z, coefficients, port)
-    return _pupil_at(across, ahead, coefficients, found.depth, meter, axis)[1]._replace(found=found.found)
+    about = about_axis(X, Y, Z, coefficients, port)
+    return _pupil_at(about, coefficients, found.depth, meter)[1]._replace(found=found.found)
 
 
-def _pupil_at(
-    across: Tensor,
-    ahead: Tensor,
-    coefficients: Tensor,
-    depth: Tensor,
-    meter: Tensor | float,
-    axis: tuple[Tensor, ...] | None,
-) -> tuple[Tensor, Pupil]:
+def _pupil_at(about: _About, coefficients: Tensor, depth: Tensor, meter: Tensor | float) -> tuple[Tensor, Pupil]:
     """The right side of the equation for a ray that starts at `depth`, to points of `about_axis`."""
+    across, ahead, axis = about
     below = ahead - depth
     ratio = _angle_over_root(across, below)
     square = ratio * ratio * across
@@ -372,9 +367,7 @@ class Projection(NamedTuple):
 
     def of(self, chosen: slice) -> Projection:
         """The same of some along the first dimension, which all have."""
-        meter, plane = (None if each is None else each[chosen] for each in (self.by_meter, self.plane))
-        pixels, by_point, by_camera, regular = (each[chosen] for each in self[:4])
-        return Projection(pixels, by_point, by_camera, regular, meter, plane)
+        return Projection(*(None if each is None else each[chosen] for each in self))  # type: ignore[arg-type]
 
 
 def to_pixels(x: Tensor, y: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
