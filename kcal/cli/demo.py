@@ -190,8 +190,7 @@ def real_pairs(
     output: Path, folder: Path, size: str, square: str, board: kcal.Board, origin: kcal.Origin | None, heading: float
 ) -> None:
     """Calibrate from a folder of pairs, and locate two opposite corners of each board, whose distance is known."""
-    images = {side: _side_images(folder, side) for side in SIDES}
-    _calibrate_both(output, images, ("--board", size, "--square", square))
+    _calibrate_both(output, {side: _side_images(folder, side) for side in SIDES}, ("--board", size, "--square", square))
     cameras, seen = ([output / f"{side}.{kind}.json" for side in SIDES] for kind in ("camera", "obs"))
     # Few pairs: none is left out, so that each board can be compared.
     run("rig", *cameras, "--pairs", *seen, "--keep-all", "-o", output / "rig.json")
@@ -320,8 +319,7 @@ def _render(scene: rooms.DemoScene, folder: Path) -> None:
     """Write the site's images, a folder for each camera."""
     with steps("rendering", scene.images) as advance:
         for view in rooms.render_demo(scene, advance):
-            place = make_folder(folder / f"{view.camera}-near")
-            rooms.write_png(place / f"{view.name}.png", view.image.numpy())
+            rooms.write_png(make_folder(folder / f"{view.camera}-near") / f"{view.name}.png", view.image.numpy())
 
 
 def _write_places(path: Path, points: rooms.NamedPoints, sigma: float | None = None) -> None:

@@ -159,9 +159,7 @@ OBSERVATIONS = Wanted(
     _FROM_IMAGES,
 )
 SHOWN = dataclasses.replace(
-    ANY_CAMERA,
-    words="a camera, rig or observations file",
-    kinds=ANY_CAMERA.kinds | {"observations"},
+    ANY_CAMERA, words="a camera, rig or observations file", kinds=ANY_CAMERA.kinds | {"observations"}
 )
 BOARD = Wanted(
     "a kcal board file",
@@ -238,8 +236,7 @@ def given_texts(value: Any) -> list[str]:
 
 def given_files(value: Any) -> list[str]:
     """The files and folders among it."""
-    texts = given_texts(value)
-    return [path for text in texts for path in (text, text.rpartition(":")[0]) if os.path.exists(path)]
+    return [path for text in given_texts(value) for path in (text, text.rpartition(":")[0]) if os.path.exists(path)]
 
 
 def check_given(files: Sequence[tuple[str, Wanted, Any]]) -> None:

@@ -416,8 +416,7 @@ class Command(TyperCommand):
             if text := whole.get_help(ctx):
                 print(text)
             ctx.exit()
-        words = ["--help" if word == "--help-all" else word for word in args]
-        return super().parse_args(ctx, self._spread(words))
+        return super().parse_args(ctx, self._spread(["--help" if word == "--help-all" else word for word in args]))
 
     def _spread(self, words: list[str]) -> list[str]:
         """Each value of an option that takes several with the flag before it, as typer wants them.
