@@ -113,16 +113,6 @@ def _save_site_summary(output: Path, scene: rooms.DemoScene, table: list[list[st
     )  # fmt: skip
 
 
-def _save_pairs_summary(output: Path, table: list[list[str]], command: str) -> None:
-    """That of a folder of pairs, with the board's diagonal in each pair, known and located."""
-    file = rooms.RigFile.load(output / "rig.json")
-    rooms.save_summary(
-        output / "summary.html", "demo_pairs_page", folder=output, table=table, command=command,
-        residuals=_residuals_text(file), pairs=0 if file.calibration is None else file.calibration.pairs,
-        baseline=length_text(float(file.rig().baseline), digits=5),
-    )  # fmt: skip
-
-
 def _residuals_text(file: rooms.RigFile) -> str:
     cameras = zip(SIDES, [camera.calibration for camera in file.cameras], strict=True)
     rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
@@ -204,7 +194,12 @@ def real_pairs(
     out.print("\nThe board's diagonal, true against estimated")
     rows = rooms.diagonal_rows(located, board)
     print_table(rows)
-    _save_pairs_summary(output, rows, command)
+    file = rooms.RigFile.load(output / "rig.json")
+    rooms.save_summary(
+        output / "summary.html", "demo_pairs_page", folder=output, table=rows, command=command,
+        residuals=_residuals_text(file), pairs=0 if file.calibration is None else file.calibration.pairs,
+        baseline=length_text(float(rig.baseline), digits=5),
+    )  # fmt: skip
     if origin is None:
         print_label("note", "no --site was given: positions are placed at latitude 0, longitude 0")
     print_results(output, command)

@@ -244,8 +244,7 @@ def carried_covariance(
     same = camera.model.fisheye == substitute.model.fisheye and all(names[index] in wanted for index in free)
     if same and not misfit:
         moved = half.new_zeros(len(half), len(wanted))
-        for index in free:
-            moved[:, wanted.index(names[index])] = half[:, index]
+        moved[:, [wanted.index(names[index]) for index in free]] = half[:, free]
         return moved.T @ moved
     rays, valid = camera.unproject(camera.grid(33, 25).reshape(-1, 2))
     own, _, seen = pixel_slopes(camera, rays, torch.inf, free)

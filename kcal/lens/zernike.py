@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kcal.dispatch import is_differentiated, is_traced, may_branch, may_overwrite
 from kcal.errors import InputError
-from kcal.lens.field_modes import WeightPrior
+from kcal.lens.field_modes import FieldModes, WeightPrior
 
 # Evaluate sums of Zernike modes by products of constant matrices, in few operations: for few places.
 #
@@ -193,7 +193,7 @@ _Place = tuple[slice, slice] | None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ZernikeModes:
+class ZernikeModes(FieldModes):
     """Which modes a field has, by their highest degrees.
 
     Args:
@@ -238,10 +238,6 @@ class ZernikeModes:
         derived = _derived(self.radial, self.decentered, self.astigmatic, self.other)
         for name, value in zip(_DERIVED, derived, strict=True):
             object.__setattr__(self, name, value)
-
-    def __len__(self) -> int:
-        """Number of real weights."""
-        return len(self.real_modes)
 
     @property
     def radial_names(self) -> frozenset[str]:
