@@ -305,8 +305,7 @@ def _more_draws(scene: rooms.DemoScene, rig: kcal.Rig) -> str:
     draws, targets = 200, scene.points_rig(scene.targets)
     marks = rooms.mark_points(scene.rig, targets.repeat(draws, 1), scene.mark_sigma, scene.generator(-30))
     ranges = targets.norm(dim=-1).repeat(draws)
-    localize = kcal.Localizer(rig, pixel_sigma=scene.mark_sigma)
-    share = rooms.interval_coverage(localize, marks.left, marks.right, ranges)
+    share = rooms.interval_coverage(kcal.Localizer(rig, pixel_sigma=scene.mark_sigma), marks.left, marks.right, ranges)
     return f"With {draws} other draws of the noise in the marks, {100 * share:.0f} % of the intervals contain it."
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
+import re
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -289,13 +290,8 @@ def check_kinds(found: Sequence[_Given]) -> None:
 
 def typed_with(exchange: dict[str, str], *more: str) -> str:
     """The command as it was typed, with other files and with more words: it can be pasted."""
-    words = []
-    for word in typed:
-        option, equals, value = word.partition("=")
-        if equals and word.startswith("--"):
-            words.append(f"{option}={exchange.get(value, value)}")
-        else:
-            words.append(exchange.get(word, word))
+    parts = (re.findall(r"\A(--[^=]*=)?(.*)\Z", word, re.DOTALL)[0] for word in typed)
+    words = [option + exchange.get(value, value) for option, value in parts]
     return f"kcal {shlex.join([*words, *more])}"
 
 

@@ -175,8 +175,7 @@ def solve_and_write(
     kcal.save_rig(rig, output)
     console.draw_picture(picture, lambda: kcal.report.rig_figure(result))
     if two:
-        baseline = float(rig.baseline)
-        tell(baseline_m=baseline, baseline_sigma_m=result.sigma_baseline, pairs=list(result.pairs))
+        tell(baseline_m=float(rig.baseline), baseline_sigma_m=result.sigma_baseline, pairs=list(result.pairs))
         _print_ranges(rig, noise, note)
     else:
         tell(undetermined=list(result.undetermined))

@@ -197,10 +197,8 @@ def camera_stack(cameras: Sequence[Camera]) -> CameraStack:
     """Put cameras together, once for many calls while they stay as they are."""
     if not stackable(cameras):
         return CameraStack(cameras, None, None)
-    regions = zip(*(camera.valid_region for camera in cameras), strict=True)
-    ready = PreparedInverse(
-        Region(*(torch.stack(parts) for parts in regions)), torch.stack([camera.inverse_start for camera in cameras])
-    )
+    region = Region(*map(torch.stack, zip(*(camera.valid_region for camera in cameras), strict=True)))
+    ready = PreparedInverse(region, torch.stack([camera.inverse_start for camera in cameras]))
     return CameraStack(cameras, torch.stack([camera.values for camera in cameras]), ready)
 
 

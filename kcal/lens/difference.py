@@ -168,7 +168,7 @@ def camera_difference(
         pixels=pixels,
         shift=away.reshape(pixels.shape),
         sigma=None if sigma is None else sigma.reshape(pixels.shape[:2]),
-        known=(_errors(first) is not None, _errors(second) is not None),
+        known=(_known_errors(first) is not None, _known_errors(second) is not None),
         rotation=turn,
         translation=shift,
         at=at,
@@ -177,7 +177,7 @@ def camera_difference(
     )
 
 
-def _errors(camera: Camera) -> CameraInformation | None:
+def _known_errors(camera: Camera) -> CameraInformation | None:
     known = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
     return known if known is not None and known.lens_size > 0 else None
 
@@ -186,7 +186,7 @@ def _inverse_variances(first: Camera, second: Camera, pixels: Tensor, good: Tens
     """(N,) inverse variances with mean one, zero where a camera has no ray."""
     variance = torch.zeros_like(pixels[:, 0])
     for camera in (first, second):
-        if _errors(camera) is not None:
+        if _known_errors(camera) is not None:
             variance = variance + 0.5 * pixel_covariance(camera, pixels).diagonal(dim1=-2, dim2=-1).sum(-1)
     good = good & variance.isfinite()
     typical = torch.maximum(variance[good].median(), 1e-6 * variance[good].max())
@@ -221,7 +221,7 @@ def _judged(
     roots = []
     root = weight.sqrt()[:, None, None]
     for camera, here in zip((first, second), places, strict=True):
-        if (known := _errors(camera)) is None:
+        if (known := _known_errors(camera)) is None:
             continue
         wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
         by_camera, by_motion, good = pixel_slopes(camera, here, at, wanted)
@@ -246,8 +246,7 @@ def _judged(
     # The weighted sum of squares of normal errors has nearly a scaled χ² distribution (Satterthwaite 1946).
     scale, degrees = squared / expected, expected**2 / squared
     probability = float(chi2_tail(found / scale, degrees))
-    sigma = torch.where(weight > 0, sigma, torch.nan)
-    return sigma, math.sqrt(found / expected), probability
+    return torch.where(weight > 0, sigma, torch.nan), math.sqrt(found / expected), probability
 
 
 def difference_text(found: CameraDifference) -> list[str]:

@@ -525,8 +525,7 @@ def _largest_distance(
     """Largest distance between pixels and those of rays by the formulas; infinite if few are found."""
     x, y = plane_from_points(X, Y, Z, model)
     lens = distort_components(x, y, parameters[len(INTRINSICS) :], model, slopes=False)
-    own = torch.stack(to_pixels(lens.x, lens.y, parameters), -1)
-    distance = torch.linalg.vector_norm(own - pixels, dim=-1)
+    distance = torch.linalg.vector_norm(torch.stack(to_pixels(lens.x, lens.y, parameters), -1) - pixels, dim=-1)
     if found is not None:
         if float(found.double().mean()) < 0.9:
             return math.inf

@@ -235,15 +235,13 @@ def solve_safeguarded(
     return x, y, valid
 
 
-def _images(points: Tensor, lenses: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:
+def _images(points: Tensor, lenses: Tensor, model: LensModel) -> tuple[Tensor, ...]:
     """Images x, y (cameras, N) of points (cameras, N, 2) of each region."""
     lens = distort_components(points[..., 0], points[..., 1], lenses, model)
     regular = lens.positive & (lens.determinant > 0)
     # Images that are no part of the lens: far enough never to be the nearest, and still finite when squared.
-    image_x, image_y = (
-        torch.where(regular, value, _FAR).clamp(-_FAR, _FAR).nan_to_num(_FAR) for value in (lens.x, lens.y)
-    )
-    return image_x, image_y
+    both = torch.where(regular, torch.stack([lens.x, lens.y]), _FAR)
+    return both.clamp(-_FAR, _FAR).nan_to_num(_FAR).unbind()
 
 
 def _edge_fraction(x: Tensor, y: Tensor, edge_x: Tensor, edge_y: Tensor) -> Tensor:

@@ -177,8 +177,7 @@ def pixel_slopes(camera: Camera, places: Tensor, at: float, wanted: list[int]) -
     rays = torch.where(valid[:, None], rays, rays.new_tensor([0.0, 0.0, 1.0]))
     points = FAR * rays if math.isinf(at) else camera.ray_origins(rays) + at * rays
     seen = project_components(points.T, camera.params.detach(), camera.model, wanted)
-    by_motion = step_rows(seen.by_point, points.T)
-    return seen.by_camera.permute(2, 1, 0), by_motion.permute(2, 1, 0), valid & seen.regular
+    return seen.by_camera.permute(2, 1, 0), step_rows(seen.by_point, points.T).permute(2, 1, 0), valid & seen.regular
 
 
 @torch.no_grad()

@@ -54,8 +54,7 @@ def rough_rig(cameras: tuple[Camera, Camera], points: tuple[Keypoints, Keypoints
     first, second = rays[0][0][good], rays[1][0][good]
     count = 0
     if len(first) >= _NEEDED:
-        tolerance = _FIRST_BAND / float(cameras[0].focal[0].detach())
-        rotation, shift, inside = pose_between(first, second, tolerance)
+        rotation, shift, inside = pose_between(first, second, _FIRST_BAND / float(cameras[0].focal[0].detach()))
         count = int(inside.sum())
     if count < _NEEDED:
         raise InputError(
