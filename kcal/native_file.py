@@ -47,11 +47,7 @@ class Record(pydantic.BaseModel):
     reads the file.
     """
 
-    __repr__ = brief
-
-    def __str__(self) -> str:
-        return repr(self)
-
+    __repr__ = __str__ = brief
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     _LATER: ClassVar[Mapping[str, Any]] = {}
 

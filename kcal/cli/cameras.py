@@ -367,8 +367,7 @@ def interpolate_command(
     if isinstance(made, kcal.lens.LensSetting) and made.interpolated_from:
         by = [f"{number_text(value, digits=2)} by {name}" for name, value in parts.items() if value]
         how, whence = "interpolated", f": {', '.join(by)}"
-    known = f"points at infinity ± {number_text(total, digits=2)} px (median)"
-    out.print(f"{made}, {how}: {known}{whence}")
+    out.print(f"{made}, {how}: points at infinity ± {number_text(total, digits=2)} px (median){whence}")
     tell(setting=wanted, sigma_px={"median": total, **parts})
     kcal.save_camera(found.camera, output, name=output.name.split(".")[0])
     print_wrote(output)

@@ -111,8 +111,7 @@ def draw_picture(path: Path | None, figure: Callable[[], Any]) -> None:
 
 def print_replaced(written: Mapping[Path, bool]) -> None:
     """Name on the error stream the files that were replaced and of which nothing was said."""
-    names = [str(path) for path, anew in written.items() if anew and str(path) not in told.get("wrote", ())]
-    if names:
+    if names := [str(path) for path, anew in written.items() if anew and str(path) not in told.get("wrote", ())]:
         others = [f"{len(names) - 3} other files"] if len(names) > 3 else []
         err.print(f"replaced {', '.join([*names[:3], *others])}")
 

@@ -254,7 +254,10 @@ def simulated_site(output: Path, seed: int) -> None:
         f"{scene.near_views} views of a printed board by each, {len(scene.landmarks.names)} surveyed landmarks, "
         f"{len(scene.targets.names)} targets."
     )
-    _render(scene, output / "images")
+    with steps("rendering", scene.images) as advance:
+        for view in rooms.render_demo(scene, advance):
+            place = make_folder(output / "images" / f"{view.camera}-near")
+            rooms.write_png(place / f"{view.name}.png", view.image.numpy())
     lap("rendering")
     board = scene.near_board
     size = "--board", f"{board.columns}x{board.rows}", "--square", f"{1e3 * board.square:g}mm"
@@ -307,13 +310,6 @@ def _more_draws(scene: rooms.DemoScene, rig: kcal.Rig) -> str:
     ranges = targets.norm(dim=-1).repeat(draws)
     share = rooms.interval_coverage(kcal.Localizer(rig, pixel_sigma=scene.mark_sigma), marks.left, marks.right, ranges)
     return f"With {draws} other draws of the noise in the marks, {100 * share:.0f} % of the intervals contain it."
-
-
-def _render(scene: rooms.DemoScene, folder: Path) -> None:
-    """Write the site's images, a folder for each camera."""
-    with steps("rendering", scene.images) as advance:
-        for view in rooms.render_demo(scene, advance):
-            rooms.write_png(make_folder(folder / f"{view.camera}-near") / f"{view.name}.png", view.image.numpy())
 
 
 def _write_places(path: Path, points: rooms.NamedPoints, sigma: float | None = None) -> None:

@@ -90,8 +90,7 @@ def _exact_line(result: rooms.RigResult, rig: kcal.Rig) -> str:
         f"in one of them is {number_text(100.0 * share, digits=2)} % of a range of {length_text(far, digits=2)}"
     )
     cameras = dict(zip(result.names, result.data.cameras, strict=True))
-    known = {name: cameras[name].calibration for name in result.exact}
-    bare = [name for name, one in known.items() if one is None or one.covariance is None]
+    bare = [name for name in result.exact if (one := cameras[name].calibration) is None or one.covariance is None]
     if not bare:
         return text
     return f"{text}. Without error bars came {' and '.join(bare)}: calibrate with kcal, or import a file that has them"

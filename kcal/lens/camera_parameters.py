@@ -105,8 +105,7 @@ class LensParameters(Operations, StatedModule):
             ['fx', 'k1']
         """
         known = self.names if self.field is None else (*self.names, "field")
-        unknown = [name for name in names if name not in known]
-        if unknown:
+        if unknown := [name for name in names if name not in known]:
             raise InputError(f"unknown parameter {unknown[0]!r}: there are {', '.join(known)}")
         chosen = names or tuple(name for name in known if name != "skew")
         with torch.no_grad():

@@ -261,9 +261,7 @@ def difference_text(found: CameraDifference) -> list[str]:
         lines[-1] += f" and a shift by {length_text(float(found.translation.norm()))}"
     if found.ratio is None or found.probability is None or spread is None or typical is None:
         return [*lines, "no error bars in either file: whether this is more than their uncertainty cannot be said"]
-    whose = {(True, True): "both cameras", (True, False): "the first camera alone"}.get(
-        found.known, "the second camera alone"
-    )
+    whose = "both cameras" if all(found.known) else f"the {'first' if found.known[0] else 'second'} camera alone"
     explained = (
         f"{number_text(found.ratio)} times what they predict, as large by chance with probability "
         f"{number_text(found.probability, digits=2)}"

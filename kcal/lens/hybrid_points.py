@@ -381,9 +381,7 @@ class FittedPolynomials:
 
 def worth_fitting(points: Tensor, parameters: Tensor, model: LensModel) -> bool:
     """Whether polynomials may map these points (..., N, K), and are worth their fit."""
-    if is_traced() or model.hybrid is None or parameters.ndim > 1:
-        return False
-    if not isinstance(model.hybrid.modes, ZernikeModes):
+    if is_traced() or parameters.ndim > 1 or not (model.hybrid and isinstance(model.hybrid.modes, ZernikeModes)):
         return False
     on_host = points.device.type == "cpu" and parameters.device.type == "cpu"
     return on_host and points.numel() >= FEWEST * points.shape[-1] and may_overwrite(points, parameters)

@@ -172,10 +172,9 @@ class HybridForm:
         object.__setattr__(self, "leading", LEADING + PORT * self.port)
         object.__setattr__(self, "names", self.leading + self.modes.names)
 
-    def constants(self, like: Tensor) -> tuple[Tensor, Tensor]:
+    def constants(self, like: Tensor) -> tuple[Tensor, ...]:
         """s₀ and 1 / ρ as tensors on the device of `like`: ONNX would write plain numbers as float32."""
-        shape, inverse = torch.tensor((self.shape, 1.0 / self.radius), dtype=like.dtype, device=like.device).unbind()
-        return shape, inverse
+        return torch.tensor((self.shape, 1.0 / self.radius), dtype=like.dtype, device=like.device).unbind()
 
     @property
     def radial_names(self) -> frozenset[str]:
