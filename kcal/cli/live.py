@@ -407,8 +407,7 @@ def _summary(watcher: rooms.Watcher, hooks: list[rooms.Webhook]) -> str:
     parts = [f"{watcher.looks:,} measurements, {watcher.alarms:,} alarms"]
     if watcher.skipped:
         parts.append(f"{watcher.skipped:,} images not after the last measurement, left out")
-    failed = sum(hook.failed for hook in hooks)
-    if failed:
+    if failed := sum(hook.failed for hook in hooks):
         parts.append(f"{failed:,} times a webhook did not answer")
     return "; ".join(parts)
 

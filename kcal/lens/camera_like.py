@@ -256,7 +256,8 @@ def project_stack(stack: CameraStack, points: Tensor, wanted: Sequence[Sequence[
             [torch.zeros_like(one.pixels) if one.by_meter is None else one.by_meter for one in each], -3
         )
     columns = zip(*(one[:4] for one in each), strict=True)
-    return Projection(*map(torch.stack, columns, _CAMERAS), rates)  # type: ignore[arg-type]
+    pixels, by_point, by_camera, regular = map(torch.stack, columns, _CAMERAS)
+    return Projection(pixels, by_point, by_camera, regular, rates)
 
 
 # The ray of every pixel: as the `forward` of a module, and for renderers that take rays in place of a camera model.

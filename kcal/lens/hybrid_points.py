@@ -362,21 +362,24 @@ class FittedPolynomials:
     def __init__(self) -> None:
         self._key: Tensor | None = None
         self._forward: Forward | None = None
-        self._backward: list[Backward | None] = []  # empty until it is asked for
+        self._backward: Backward | None = None
+        self._has_backward = False
 
     def forward(self, parameters: Tensor, model: LensModel, region: Region) -> Forward | None:
         """The way from points to pixels; None if polynomials are not accurate enough."""
         key = torch.cat([parameters, region.radius[None]])
         if self._key is None or not torch.equal(key, self._key):
-            self._forward, self._backward, self._key = fit_forward(parameters, model, region), [], key
+            self._forward, self._backward, self._has_backward = fit_forward(parameters, model, region), None, False
+            self._key = key
         return self._forward
 
     def backward(self, parameters: Tensor, model: LensModel, ready: PreparedInverse) -> Backward | None:
         """The way from pixels to rays; None if polynomials are not accurate enough."""
         forward = self.forward(parameters, model, ready.region)
-        if forward is not None and not self._backward:
-            self._backward = [fit_backward(forward, parameters, model, ready)]
-        return None if forward is None else self._backward[0]
+        if forward is not None and not self._has_backward:
+            self._backward = fit_backward(forward, parameters, model, ready)
+            self._has_backward = True
+        return self._backward
 
 
 def worth_fitting(points: Tensor, parameters: Tensor, model: LensModel) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -314,7 +314,7 @@ class Cylinder(StatedModule):
         """Size."""
         return self.size
 
-    grid = Camera.grid
+    grid: Any = Camera.grid
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Map pixels (..., N, 2) to rays (..., N, 3) of length one, and valid (..., N): not behind the seam."""
