@@ -48,7 +48,7 @@ def warn_user(message: str) -> None:
         return str(sys._getframe(level + 1).f_globals.get("__name__", ""))
 
     level = 2
-    while module(level) in ("kcal.doors", "kcal.threads"):
+    while module(level) in ("kcal.doors", "contextlib"):
         level += 1
     if not module(level).startswith("kcal."):
         warnings.warn(message, KcalWarning, stacklevel=level + 1)

@@ -277,8 +277,7 @@ def _pnm(data: bytes) -> Size:
 
 
 def _jpeg2000(data: bytes) -> Size:
-    at = data.index(b"\xff\x4f\xff\x51")
-    right, bottom, left, top = struct.unpack_from(">IIII", data, at + 8)
+    right, bottom, left, top = struct.unpack_from(">IIII", data, data.index(b"\xff\x4f\xff\x51") + 8)
     return right - left, bottom - top
 
 

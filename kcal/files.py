@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import hashlib
 import json
@@ -12,10 +11,10 @@ import secrets
 import stat
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from types import ModuleType, TracebackType
-from typing import Any, BinaryIO, Self
+from types import ModuleType
+from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
 from kcal.errors import FileError, InputError
@@ -66,7 +65,7 @@ PARTS_ARE_LOCKED = _fcntl is not None
 _FAR = 1 << 20
 
 
-class FileLock:
+class FileLock(ExitStack):
     """Keep other processes that ask for the same files from getting them, until `release` or the end of this one.
 
     Beside each file, a hidden `.NAME.lock` says who has it. The lock itself is the operating system's: what a killed
@@ -86,32 +85,24 @@ class FileLock:
         ['.a.csv.lock']
     """
 
+    release = ExitStack.close
+
     def __init__(self, paths: Sequence[Path], work: str) -> None:
-        self._held: list[tuple[Path, int]] = []
+        super().__init__()
         try:
             for path in dict.fromkeys(Path(os.path.realpath(path)) for path in paths):
                 lock = path.with_name(f".{path.name}.lock")
-                self._held.append((lock, _locked(lock, path, work)))
+                self.callback(_unlock, lock, _locked(lock, path, work))
         except BaseException:
-            self.release()
+            self.close()
             raise
 
-    def release(self) -> None:
-        """Let others have the files."""
-        while self._held:
-            lock, handle = self._held.pop()
-            # While it is still locked: nobody else has it by then. Windows removes no open file.
-            with contextlib.suppress(OSError):
-                lock.unlink()
-            os.close(handle)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.release()
+def _unlock(lock: Path, handle: int) -> None:
+    # While it is still locked: nobody else has it by then. Windows removes no open file.
+    with suppress(OSError):
+        lock.unlink()
+    os.close(handle)
 
 
 def _locked(lock: Path, path: Path, work: str) -> int:
@@ -207,7 +198,8 @@ def read_head(path: str | Path, count: int) -> bytes:
 @contextmanager
 def _regular_file(path: str | Path) -> Iterator[BinaryIO]:
     try:
-        with open(path, "rb", opener=_open_at_once) as file:
+        # Opening a pipe would wait for somebody to write into it.
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 raise FileError(f"{path}: not a regular file; a pipe or a device cannot be read here")
             if _watching:
@@ -215,11 +207,6 @@ def _regular_file(path: str | Path) -> Iterator[BinaryIO]:
             yield file
     except (OSError, ValueError) as error:
         raise FileError(f"{path}: cannot read: {_reason(error)}") from error
-
-
-def _open_at_once(path: str, flags: int) -> int:
-    # Opening a pipe would wait for somebody to write into it.
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def _reason(error: OSError | ValueError) -> str:
@@ -256,7 +243,7 @@ def check_writable(path: str | Path, *inputs: str | Path) -> Path:
     return path
 
 
-def check_picture(path: str | Path) -> None:
+def check_picture(path: str | Path) -> Path:
     """Raise an error now if `path` could not be written as a picture later.
 
     Raises:
@@ -265,7 +252,7 @@ def check_picture(path: str | Path) -> None:
     """
     if Path(path).suffix.lower() not in (".png", ".svg", ".pdf"):
         raise InputError(f"{path}: the name of a picture must end with .png, .svg or .pdf")
-    check_writable(path)
+    return check_writable(path)
 
 
 def make_folder(path: str | Path) -> Path:

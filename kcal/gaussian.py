@@ -182,8 +182,7 @@ def stacked(gaussians: Sequence[Gaussian]) -> Gaussian:
 
 def triangular(rows: Tensor) -> Tensor:
     """(C, C) upper triangle with the same products as rows (R, C)."""
-    missing = max(0, rows.shape[1] - len(rows))
-    padded = torch.cat([rows, rows.new_zeros(missing, rows.shape[1])])
+    padded = torch.cat([rows, rows.new_zeros(max(0, rows.shape[1] - len(rows)), rows.shape[1])])
     return torch.linalg.qr(padded, mode="r")[1]
 
 

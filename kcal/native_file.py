@@ -163,8 +163,7 @@ class NativeFile(Record):
             checked = cls.model_validate_json(text, strict=True)
         except pydantic.ValidationError as error:
             found = error.errors(include_input=False)
-            wrong = {one["loc"][: one["loc"].index(_DERIVED)] for one in found if _DERIVED in one["loc"]}
-            if wrong:
+            if wrong := {one["loc"][: one["loc"].index(_DERIVED)] for one in found if _DERIVED in one["loc"]}:
                 return cls.parse({"kcal": kind, "version": version, **_underived(content, wrong)}, source)
             raise FileError(": ".join(filter(None, [source, f"bad {kind} file", *_first_fault(found[0])]))) from error
         if (place := _not_finite(content)) is not None:

@@ -67,14 +67,13 @@ Shape = tuple[int, ...]
 
 def shapes_of(kind: type[tuple], **other: Shape | torch.dtype | tuple[Shape, torch.dtype]) -> dict[str, Any]:
     """`Operations.results` of a `forward` that returns a named tuple: float64 numbers, but for the `other` ones."""
-    both: list[Any] = []
-    for name in kind._fields:  # type: ignore[attr-defined]
-        one = other.get(name, ())
+
+    def both(one: Any) -> Any:
         if isinstance(one, torch.dtype):
-            both.append(((), one))
-        else:
-            both.append(one if one and isinstance(one[-1], torch.dtype) else (one, torch.float64))
-    return {"forward": tuple(both)}
+            return (), one
+        return one if one and isinstance(one[-1], torch.dtype) else (one, torch.float64)
+
+    return {"forward": tuple(both(other.get(name, ())) for name in kind._fields)}  # type: ignore[attr-defined]
 
 
 class _Method(nn.Module):

@@ -214,8 +214,7 @@ def _array(reader: _Reader, depth: int) -> tuple[str, Any]:
         name_of_coding = {1: "utf-8", 2: "utf-8", 16: "utf-8", 4: "utf-16", 17: "utf-16", 18: "utf-32"}.get(coding)
         if name_of_coding is None:
             raise ValueError(f"{name}: characters of kind {coding}")
-        endings = {"<": "-le", ">": "-be"}
-        suffix = "" if name_of_coding == "utf-8" else endings[reader.order]
+        suffix = "" if name_of_coding == "utf-8" else {"<": "-le", ">": "-be"}[reader.order]
         return name, text.decode(name_of_coding + suffix, "replace")
     if kind in _NUMBERS:
         values = reader.values()
@@ -283,7 +282,10 @@ def read_storage(data: bytes, source: str) -> dict[str, Any]:
         text = data.decode("utf-8-sig")
         start = text.lstrip()[:1]
         if start == "<":
-            found = _from_xml(read_xml(text, source))
+            root = read_xml(text, source)
+            if root.tag != "opencv_storage":
+                raise ValueError(f"the root element is {root.tag[:40]!r}, not opencv_storage")
+            found = _of_element(root)
         else:
             found = _plain(read_json(data, source)) if start == "{" else _from_yaml(text)
     except (ValueError, OverflowError) as error:
@@ -335,17 +337,10 @@ def _plain(value: Any) -> Any:
     return float(value) if isinstance(value, int | float) else str(value)
 
 
-def _from_xml(root: Element) -> Any:
-    if root.tag != "opencv_storage":
-        raise ValueError(f"the root element is {root.tag[:40]!r}, not opencv_storage")
-    return _of_element(root)
-
-
 def _of_element(element: Element) -> Any:
     children = list(element)
     if not children:
-        parts = re.findall(r'"(?:[^"\\]|\\.)*"|[^\s"]+', element.text or "")
-        values = [_scalar(part) for part in parts]
+        values = [_scalar(part) for part in re.findall(r'"(?:[^"\\]|\\.)*"|[^\s"]+', element.text or "")]
         if len(values) == 1:
             return values[0]
         numbers = all(isinstance(value, float) for value in values)

@@ -116,8 +116,7 @@ def page_data(value: Any) -> str:
         >>> page_data({"name": "<!--<script>"})
         '{"name": "\\u003c!--\\u003cscript\\u003e"}'
     """
-    text = json.dumps(value, allow_nan=False)
-    return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
+    return json.dumps(value, allow_nan=False).replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
 
 
 def page_policy(*, scripts: Iterable[str] = (), styles: Iterable[str] = (), images: str = "data:") -> str:

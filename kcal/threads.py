@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import faulthandler
-import functools
 import multiprocessing
 import os
 import signal
@@ -14,14 +12,12 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
-from typing import Any, Generic, ParamSpec, TypeVar
+from typing import Any, Generic, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
 # Bound the threads of torch, BLAS and OpenCV in this process, and give the caller's own settings back.
 
-P = ParamSpec("P")
-R = TypeVar("R")
 # What brings libraries with threads. To look for these takes milliseconds: only after one of them was imported.
 _BRING = ("torch", "numpy", "scipy.linalg", "cv2")
 _PROCESS = os.getpid()
@@ -115,7 +111,7 @@ def loaded() -> list[bool]:
     return [name in sys.modules for name in _BRING]
 
 
-@contextlib.contextmanager
+@contextmanager
 def one_thread() -> Iterator[None]:
     """Use one thread while many small systems are solved.
 
@@ -147,15 +143,8 @@ def one_thread() -> Iterator[None]:
         give_back()
 
 
-def in_one_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """A function whose calls use `one_thread`."""
-
-    @functools.wraps(function)
-    def bounded(*arguments: P.args, **named: P.kwargs) -> R:
-        with one_thread():
-            return function(*arguments, **named)
-
-    return bounded
+# Decorates a function whose calls use `one_thread`.
+in_one_thread = one_thread()
 
 
 # `Handover`: items from a thread that makes them to the one that uses them, in bounded memory.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated
 
 import kcal
-from kcal.cli import kinds, rooms
+from kcal.cli import console, kinds, rooms
 from kcal.cli.console import board_words, ending_with, err, out, print_left_out, print_wrote, steps, tell, warn
 from kcal.cli.inputs import typed, typed_with
 from kcal.cli.options import Kind
@@ -57,11 +57,8 @@ def board_print_command(
     write_atomic(output, rooms.to_svg(sheet.drawing) if suffix == ".svg" else rooms.to_pdf(sheet.drawing))
     out.print(f"{output}: {pattern}, page {sheet.drawing.width:g}x{sheet.drawing.height:g} mm")
     if sheet.quiet < 1:
-        white = (
-            f"{sheet.quiet:.1f} squares"
-            if pattern.pattern == "checkerboard"
-            else f"{sheet.quiet * sheet.margin:.0f} mm"
-        )
+        squares = pattern.pattern == "checkerboard"
+        white = f"{sheet.quiet:.1f} squares" if squares else f"{sheet.quiet * sheet.margin:.0f} mm"
         out.print(f"note: only {white} of white around the board; keep the background light")
     if not pattern.unambiguous:
         out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
@@ -93,8 +90,7 @@ def board_measure_command(
         found = rooms.fit_cameras(sets, names=names, advance=advance)
     board = dataclasses.replace(found.boards[0], name=output.name.split(".")[0])
     kcal.calibrate.save_measured_board(board, output)
-    if picture is not None:
-        kcal.report.save_picture(picture, rooms.board_figure(board))
+    console.draw_picture(picture, lambda: rooms.board_figure(board))
     out.print(f"{board.board}, {len(board.observations)} of {len(sets)} observations: {', '.join(board.observations)}")
     for line in rooms.board_text(board):
         out.print(f"  {line}")
@@ -210,11 +206,9 @@ def detect_command(
         source = f"of {len(paths)} images"
     for path, one in zip(outputs, observed, strict=True):
         one.save(path)
-    if gallery is not None:
-        tiles = [rooms.FailedImage(name, path, found.reason, found.rejected) for name, path, found in failed]
-        kcal.report.save_picture(gallery, rooms.gallery_figure(observed[0], tiles))
-    if coverage is not None:
-        kcal.report.save_picture(coverage, rooms.coverage_figure(observed[0]))
+    tiles = (rooms.FailedImage(name, path, found.reason, found.rejected) for name, path, found in failed)
+    console.draw_picture(gallery, lambda: rooms.gallery_figure(observed[0], list(tiles)))
+    console.draw_picture(coverage, lambda: rooms.coverage_figure(observed[0]))
 
     views = [view for one in observed for view in one.views]
     failures = [failure for one in observed for failure in one.failures]

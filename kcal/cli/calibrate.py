@@ -218,8 +218,7 @@ def calibrate_command(
     places = _camera_files(obs, output, picture, report, name)
     if model not in ("hybrid", "network"):
         kcal.lens.LensModel.named(model)
-    unknown = set(without or ()) - {"motion", "bending"}
-    if unknown:
+    if unknown := set(without or ()) - {"motion", "bending"}:
         raise InputError(f"--without {unknown.pop()}: write motion or bending")
     options = kcal.CalibrationOptions(
         model=model,
@@ -407,8 +406,7 @@ def batch_command(
     print_table(Table(columns, rows).cells, left=(0, 7, 8))
     out.print(f"{report.reused} of {report.total} pieces of work were there already")
     print_wrote(report.summary)
-    failed = [row.camera for row in report.rows if row.error]
-    if failed:
+    if failed := [row.camera for row in report.rows if row.error]:
         raise DegenerateError(
             f"{len(failed)} of {len(report.rows)} cameras failed: {', '.join(failed[:5])}; see the table"
         )

@@ -12,7 +12,7 @@ import orjson
 
 import kcal
 from kcal.cli import kinds, rooms
-from kcal.cli.console import out, print_table, print_wrote, steps, tell, tell_table, warn
+from kcal.cli.console import draw_picture, out, print_table, print_wrote, steps, tell, tell_table, warn
 from kcal.cli.inputs import cameras_and_rig, named_source, picked, single_camera
 from kcal.cli.options import Kind, Several
 from kcal.errors import InputError
@@ -75,8 +75,7 @@ def export_command(
         if misfit is None:
             out.print(f"{label}, {'baked' if done.format == 'remap' else 'exact'}")
         else:
-            text = f"{label}, fitted: RMS {misfit.rms:.2g} px, at most {misfit.largest:.2g} px over the image"
-            out.print(text)
+            out.print(f"{label}, fitted: RMS {misfit.rms:.2g} px, at most {misfit.largest:.2g} px over the image")
             if misfit.rms > _FAR:
                 warn(
                     f"{camera or 'camera'}: no lens model of {done.format} comes nearer; mrcal files (.cameramodel) "
@@ -242,8 +241,7 @@ def compare_command(
         result = kcal.calibrate.compare_models(
             seen, names, groups="views" if groups == "views" else "blocks", parts=parts, progress=advance
         )
-    count = len(result.corners)
-    out.print(f"{len(seen.views)} views; held out in {count} groups, {parts} parts; RMS per corner")
+    out.print(f"{len(seen.views)} views; held out in {len(result.corners)} groups, {parts} parts; RMS per corner")
     columns: Columns = {
         "model": "model", "held_out_rms_px": "held-out RMS, px", "more_than_best_px": "more than the best, px",
         "standard_error_px": "± standard error",
@@ -256,8 +254,7 @@ def compare_command(
     tell_table("models", table)
     if output is not None:
         write_atomic(output, table.csv)
-    if picture is not None:
-        kcal.report.save_picture(picture, rooms.models_figure(result, observations.name))
+    draw_picture(picture, lambda: rooms.models_figure(result, observations.name))
     print_wrote(output, picture)
     for name, reason in result.failures.items():
         warn(f"{name} could not be fitted to some of the views: {reason}")
@@ -370,8 +367,7 @@ def interpolate_command(
     if isinstance(made, kcal.lens.LensSetting) and made.interpolated_from:
         by = [f"{number_text(value, digits=2)} by {name}" for name, value in parts.items() if value]
         how, whence = "interpolated", f": {', '.join(by)}"
-    known = f"points at infinity ± {number_text(total, digits=2)} px (median)"
-    out.print(f"{made}, {how}: {known}{whence}")
+    out.print(f"{made}, {how}: points at infinity ± {number_text(total, digits=2)} px (median){whence}")
     tell(setting=wanted, sigma_px={"median": total, **parts})
     kcal.save_camera(found.camera, output, name=output.name.split(".")[0])
     print_wrote(output)
@@ -441,11 +437,7 @@ def file_schema(kind: str) -> dict[str, Any]:
     module, name, _ = FILES[kind]
     file = getattr(importlib.import_module(module), name)
     schema = file.model_json_schema(mode="serialization")
-    schema["properties"] = {
-        "kcal": {"const": file.KIND},
-        "version": {"const": file.VERSION},
-        **schema["properties"],
-    }
+    schema["properties"] = {"kcal": {"const": file.KIND}, "version": {"const": file.VERSION}, **schema["properties"]}
     # All fields of the version's first files are written, so that a reader need not know their defaults.
     schema["required"] = [name for name in schema["properties"] if name not in file._LATER]
     return {

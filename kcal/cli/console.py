@@ -103,11 +103,15 @@ def print_wrote(*paths: Path | None) -> None:
             out.print(f"{'replaced' if replaced(path) else 'wrote'} {path}")
 
 
+def draw_picture(path: Path | None, figure: Callable[[], Any]) -> None:
+    """Draw and save a picture, if one was asked for."""
+    if path is not None:
+        kcal.report.save_picture(path, figure())
+
+
 def print_replaced(written: Mapping[Path, bool]) -> None:
     """Name on the error stream the files that were replaced and of which nothing was said."""
-    said = told.get("wrote", ())
-    names = [str(path) for path, anew in written.items() if anew and str(path) not in said]
-    if names:
+    if names := [str(path) for path, anew in written.items() if anew and str(path) not in told.get("wrote", ())]:
         others = [f"{len(names) - 3} other files"] if len(names) > 3 else []
         err.print(f"replaced {', '.join([*names[:3], *others])}")
 

@@ -113,16 +113,6 @@ def _save_site_summary(output: Path, scene: rooms.DemoScene, table: list[list[st
     )  # fmt: skip
 
 
-def _save_pairs_summary(output: Path, table: list[list[str]], command: str) -> None:
-    """That of a folder of pairs, with the board's diagonal in each pair, known and located."""
-    file = rooms.RigFile.load(output / "rig.json")
-    rooms.save_summary(
-        output / "summary.html", "demo_pairs_page", folder=output, table=table, command=command,
-        residuals=_residuals_text(file), pairs=0 if file.calibration is None else file.calibration.pairs,
-        baseline=length_text(float(file.rig().baseline), digits=5),
-    )  # fmt: skip
-
-
 def _residuals_text(file: rooms.RigFile) -> str:
     cameras = zip(SIDES, [camera.calibration for camera in file.cameras], strict=True)
     rms = ", ".join(f"{side} {record.rms:.3f} px" for side, record in cameras if record is not None)
@@ -190,8 +180,7 @@ def real_pairs(
     output: Path, folder: Path, size: str, square: str, board: kcal.Board, origin: kcal.Origin | None, heading: float
 ) -> None:
     """Calibrate from a folder of pairs, and locate two opposite corners of each board, whose distance is known."""
-    images = {side: _side_images(folder, side) for side in SIDES}
-    _calibrate_both(output, images, ("--board", size, "--square", square))
+    _calibrate_both(output, {side: _side_images(folder, side) for side in SIDES}, ("--board", size, "--square", square))
     cameras, seen = ([output / f"{side}.{kind}.json" for side in SIDES] for kind in ("camera", "obs"))
     # Few pairs: none is left out, so that each board can be compared.
     run("rig", *cameras, "--pairs", *seen, "--keep-all", "-o", output / "rig.json")
@@ -205,7 +194,12 @@ def real_pairs(
     out.print("\nThe board's diagonal, true against estimated")
     rows = rooms.diagonal_rows(located, board)
     print_table(rows)
-    _save_pairs_summary(output, rows, command)
+    file = rooms.RigFile.load(output / "rig.json")
+    rooms.save_summary(
+        output / "summary.html", "demo_pairs_page", folder=output, table=rows, command=command,
+        residuals=_residuals_text(file), pairs=0 if file.calibration is None else file.calibration.pairs,
+        baseline=length_text(float(rig.baseline), digits=5),
+    )  # fmt: skip
     if origin is None:
         print_label("note", "no --site was given: positions are placed at latitude 0, longitude 0")
     print_results(output, command)
@@ -260,7 +254,10 @@ def simulated_site(output: Path, seed: int) -> None:
         f"{scene.near_views} views of a printed board by each, {len(scene.landmarks.names)} surveyed landmarks, "
         f"{len(scene.targets.names)} targets."
     )
-    _render(scene, output / "images")
+    with steps("rendering", scene.images) as advance:
+        for view in rooms.render_demo(scene, advance):
+            place = make_folder(output / "images" / f"{view.camera}-near")
+            rooms.write_png(place / f"{view.name}.png", view.image.numpy())
     lap("rendering")
     board = scene.near_board
     size = "--board", f"{board.columns}x{board.rows}", "--square", f"{1e3 * board.square:g}mm"
@@ -311,17 +308,8 @@ def _more_draws(scene: rooms.DemoScene, rig: kcal.Rig) -> str:
     draws, targets = 200, scene.points_rig(scene.targets)
     marks = rooms.mark_points(scene.rig, targets.repeat(draws, 1), scene.mark_sigma, scene.generator(-30))
     ranges = targets.norm(dim=-1).repeat(draws)
-    localize = kcal.Localizer(rig, pixel_sigma=scene.mark_sigma)
-    share = rooms.interval_coverage(localize, marks.left, marks.right, ranges)
+    share = rooms.interval_coverage(kcal.Localizer(rig, pixel_sigma=scene.mark_sigma), marks.left, marks.right, ranges)
     return f"With {draws} other draws of the noise in the marks, {100 * share:.0f} % of the intervals contain it."
-
-
-def _render(scene: rooms.DemoScene, folder: Path) -> None:
-    """Write the site's images, a folder for each camera."""
-    with steps("rendering", scene.images) as advance:
-        for view in rooms.render_demo(scene, advance):
-            place = make_folder(folder / f"{view.camera}-near")
-            rooms.write_png(place / f"{view.name}.png", view.image.numpy())
 
 
 def _write_places(path: Path, points: rooms.NamedPoints, sigma: float | None = None) -> None:

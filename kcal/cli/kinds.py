@@ -156,8 +156,7 @@ RefineMethod = Annotated[
 
 
 Needs = Annotated[
-    tuple[Any, ...],
-    Kind(metavar="RANGE:ERROR", read=lambda text, _: kcal.report.Requirement.parse(text), setting=True),
+    tuple[Any, ...], Kind(metavar="RANGE:ERROR", read=lambda text, _: kcal.report.Requirement.parse(text), setting=True)
 ]
 
 
@@ -215,8 +214,7 @@ Raster = Annotated[Path, Kind(metavar="RASTER")]
 
 
 def _read_picture(text: str, name: str) -> Path:
-    check_picture(text)
-    return Path(text)
+    return check_picture(text)
 
 
 Output = Annotated[Path, Kind(flags=("-o", "--output"))]

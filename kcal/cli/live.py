@@ -125,7 +125,9 @@ def live_command(
         # As `python -m` does: a detector beside which the command is run is found.
         sys.path.insert(0, os.getcwd())
         frames = rooms.Videos(
-            videos, solved, rooms.load_detector(detector), joining, late=lambda camera: _late(tracker, camera),
+            videos, solved, rooms.load_detector(detector), joining,
+            # Before the first moment the estimate is the prior.
+            late=lambda one: tracker.clock_estimate(one).offset(max(tracker.time, tracker.shared.start or 0.0))[0],
             match_sigma=match_sigma, tell=err.print,
         )  # fmt: skip
     source = frames or rooms.lines_of(
@@ -208,11 +210,6 @@ def _localizer(path: Path, rig: kcal.Rig, options: LocateOptions, *, many: bool)
             f"{path}: this rig has no place on the Earth; solve it with landmarks or positions with latitudes"
         )
     return localize
-
-
-def _late(tracker: kcal.track.Tracker, camera: int) -> float:
-    # Before the first moment the estimate is the prior.
-    return tracker.clock_estimate(camera).offset(max(tracker.time, tracker.shared.start or 0.0))[0]
 
 
 def _progress(
@@ -410,8 +407,7 @@ def _summary(watcher: rooms.Watcher, hooks: list[rooms.Webhook]) -> str:
     parts = [f"{watcher.looks:,} measurements, {watcher.alarms:,} alarms"]
     if watcher.skipped:
         parts.append(f"{watcher.skipped:,} images not after the last measurement, left out")
-    failed = sum(hook.failed for hook in hooks)
-    if failed:
+    if failed := sum(hook.failed for hook in hooks):
         parts.append(f"{failed:,} times a webhook did not answer")
     return "; ".join(parts)
 

@@ -36,8 +36,7 @@ def _print_positions(
     located: rooms.Located, true: rooms.Tensor | None, statuses: dict[str, int], *, stated: bool
 ) -> None:
     """Print the table with the reasons below it; of a long one the counts, and the rows that have a true position."""
-    errors = None if true is None else rooms.position_errors(located, true)
-    rows = rooms.position_rows(located, errors)
+    rows = rooms.position_rows(located, None if true is None else rooms.position_errors(located, true))
     shown: Sequence[int] = range(len(located.positions))
     if located.rows is not None:
         out.print(counts_text(located.rows, statuses))
@@ -123,8 +122,7 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[rooms.Point
         table does not state it.
     """
     solved = kcal.load_rig(rig)
-    stated = own.height is not None or own.terrain is not None
-    many = stated or rooms.is_long(points) or not solved.is_pair
+    many = own.height is not None or own.terrain is not None or rooms.is_long(points) or not solved.is_pair
     if many:
         refuse_of_pairs(own)
     elif own.aged is not None and own.history is not None:

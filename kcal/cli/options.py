@@ -319,12 +319,7 @@ def _declared_options(
             yield from _declared_options(fields, about | described(plain.__doc__)[1], each.name)
             continue
         kinds = [one for one in more if isinstance(one, Kind)]
-        told = {
-            field.name: value
-            for kind in kinds
-            for field in dataclasses.fields(Kind)
-            if (value := getattr(kind, field.name)) != field.default
-        }
+        told = {name: value for one in kinds for name, value in vars(one).items() if value != getattr(Kind, name)}
         kind = Kind(**told)
         yield _Option(
             name=each.name, type=plain, kind=kind, group=group,
@@ -421,8 +416,7 @@ class Command(TyperCommand):
             if text := whole.get_help(ctx):
                 print(text)
             ctx.exit()
-        words = ["--help" if word == "--help-all" else word for word in args]
-        return super().parse_args(ctx, self._spread(words))
+        return super().parse_args(ctx, self._spread(["--help" if word == "--help-all" else word for word in args]))
 
     def _spread(self, words: list[str]) -> list[str]:
         """Each value of an option that takes several with the flag before it, as typer wants them.
@@ -462,11 +456,7 @@ class Command(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; what it takes from kcal.toml is said first, in one line."""
-        names = [
-            param.name
-            for param in self.params
-            if getattr(ctx.get_parameter_source(param.name), "name", "") == "DEFAULT_MAP"
-        ]
+        names = [one.name for one in self.params if "DEFAULT_MAP" in repr(ctx.get_parameter_source(one.name))]
         taken.clear()
         taken.update(names)
         if names:

@@ -159,10 +159,7 @@ def capture_command(
             failed.append(error)
         stop.set()
 
-    threads = [
-        threading.Thread(target=watch),
-        threading.Thread(target=rooms.follow, args=(session,), kwargs={"until": over}),
-    ]
+    threads = [threading.Thread(target=watch), threading.Thread(target=lambda: rooms.follow(session, until=over))]
     server = None
     if page:
         server = rooms.LocalServer(

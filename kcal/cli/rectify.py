@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import io
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,7 +16,7 @@ from kcal.cli.console import err, out, print_styled, print_table, print_wrote, s
 from kcal.cli.inputs import cameras_and_rig, named_source, single_camera
 from kcal.cli.options import Kind
 from kcal.errors import FileError, InputError
-from kcal.files import check_writable, make_folder, read_bytes, write_atomic
+from kcal.files import check_writable, make_folder, open_atomic, read_bytes
 
 _HEAD = 256  # bytes of a PNG file, in which its note stands
 
@@ -275,9 +274,8 @@ def _write_extras(folder: Path, name: str, module: kcal.lens.Undistort, options:
 def _save_array(path: Path, values: Any) -> None:
     import numpy as np
 
-    data = io.BytesIO()
-    np.save(data, values.contiguous().numpy(), allow_pickle=False)
-    write_atomic(path, data.getvalue())
+    with open_atomic(path) as file:
+        np.save(file, values.contiguous().numpy(), allow_pickle=False)
 
 
 def _tell_view(camera: kcal.Camera, module: kcal.lens.Undistort, label: str) -> None:
@@ -332,8 +330,7 @@ def _tell_ranges(module: kcal.lens.StereoRectification) -> None:
     # Distances from the camera, of which the depth is a part.
     ahead = float(torch.hypot(torch.hypot(where[0, 0] - cx, where[0, 1] - cy), torch.tensor(focal))) / focal
     ranges = rooms.usual_ranges(module.rig)
-    apart = float(module.right_center[:2].sum())
-    disparity = focal * apart * ahead / torch.tensor(ranges, dtype=torch.float64)
+    disparity = focal * float(module.right_center[:2].sum()) * ahead / torch.tensor(ranges, dtype=torch.float64)
     found = kcal.locate.DisparityRanges(module, disparity_sigma=_DISPARITY_SIGMA).at(
         where.expand(len(ranges), 2), disparity
     )
@@ -389,21 +386,13 @@ def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.NewFil
     Ks[:, :2, 2] += 0.5
     for matrix, camera in zip(Ks, cameras, strict=True):
         matrix[[0, 1], [0, 1]] = rooms.paraxial_focal(camera).value.detach()
-    data = io.BytesIO()
-    np.savez(
-        data,
-        allow_pickle=False,
-        rays=module(viewmats).numpy(),
-        mask=module.mask.numpy(),
-        Ks=Ks.numpy(),
-        viewmats=viewmats.numpy(),
-    )
-    write_atomic(output, data.getvalue())
+    parts = {"rays": module(viewmats), "mask": module.mask, "Ks": Ks, "viewmats": viewmats}
+    with open_atomic(output) as file:
+        np.savez(file, allow_pickle=False, **{name: values.numpy() for name, values in parts.items()})
     moved = float((module.depths * module.mask).abs().max())
     width, height = cameras[0].size
     share = float(module.mask.double().mean())
-    text = f"rays {len(cameras)} x {height} x {width} x 6, float32; {100 * share:.1f} % of the pixels have one"
-    out.print(text)
+    out.print(f"rays {len(cameras)} x {height} x {width} x 6, float32; {100 * share:.1f} % of the pixels have one")
     out.print(f"rounding: at most {error:.1e} px from the pixel, at 1 m and far away")
     if moved:
         out.print(f"the rays start up to {1e3 * moved:.3g} mm from each other on the axis: the entrance pupil moves")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -20,7 +19,7 @@ from kcal.cli.options import Kind, Several
 from kcal.cli.rig_sources import cameras_of_files, check_views_of
 from kcal.errors import FileError, InputError
 from kcal.file_kind import file_kind
-from kcal.files import check_writable, read_bytes, write_atomic
+from kcal.files import check_writable, open_atomic, read_bytes
 from kcal.table import Columns, Table
 
 # The exit code of a no, apart from errors (1) and wrong usage (2).
@@ -69,11 +68,10 @@ def report_command(
     """
     subject, needs = camera_or_rig, require or ()
     given = observations or []
-    found = (
-        _of_rig(subject, given, needs, pixel_sigma)
-        if file_kind(subject) == "rig"
-        else _of_camera(subject, given, needs, baseline, pixel_sigma_of(pixel_sigma))
-    )
+    if file_kind(subject) == "rig":
+        found = _of_rig(subject, given, needs, pixel_sigma)
+    else:
+        found = _of_camera(subject, given, needs, baseline, pixel_sigma_of(pixel_sigma))
     tell(verdict=found.verdict.to_dict())
     if not told_usable(found, output):
         raise typer.Exit(NO)
@@ -393,10 +391,9 @@ def _all_refits(
 def _keep_refits(path: Path, key: str, refits: list[rooms.Refit]) -> None:
     import numpy as np
 
-    data = io.BytesIO()
     parts = {name: np.stack([np.asarray(getattr(one, name)) for one in refits]) for name in ("seed", "errors")}
-    np.savez_compressed(data, allow_pickle=False, kcal=np.array("check"), key=np.array(key), **parts)
-    write_atomic(path, data.getvalue())
+    with open_atomic(path) as file:
+        np.savez_compressed(file, allow_pickle=False, kcal=np.array("check"), key=np.array(key), **parts)
 
 
 def _kept_refits(path: Path, key: str) -> list[rooms.Refit]:
@@ -438,13 +435,9 @@ def _told_refits(found: rooms.IntervalCheck, count: int) -> bool:
         warn(f"{found.failed} of {count} simulated captures could not be calibrated; they are not counted")
     worst = min(range(len(rows)), key=lambda i: found.shares[i][0])
     share, where = 100 * found.shares[worst][0], rooms.range_label(found.ranges[worst])
-    if found.true:
-        text = f"the stated 95 % intervals are true: they contain {share:.0f} % of {count} refits, {where}"
-    else:
-        text = (
-            f"the stated 95 % intervals are too narrow: they contain {share:.0f} % of {count} refits, {where}; "
-            f"multiply σ by {found.factors[worst]:.2f}, or take more views"
-        )
+    how = "true" if found.true else "too narrow"
+    cure = "" if found.true else f"; multiply σ by {found.factors[worst]:.2f}, or take more views"
+    text = f"the stated 95 % intervals are {how}: they contain {share:.0f} % of {count} refits, {where}{cure}"
     print_answer(found.true, text)
     tell(true=found.true, refits=count, failed=found.failed)
     return found.true

@@ -90,8 +90,7 @@ def _exact_line(result: rooms.RigResult, rig: kcal.Rig) -> str:
         f"in one of them is {number_text(100.0 * share, digits=2)} % of a range of {length_text(far, digits=2)}"
     )
     cameras = dict(zip(result.names, result.data.cameras, strict=True))
-    known = {name: cameras[name].calibration for name in result.exact}
-    bare = [name for name, one in known.items() if one is None or one.covariance is None]
+    bare = [name for name in result.exact if (one := cameras[name].calibration) is None or one.covariance is None]
     if not bare:
         return text
     return f"{text}. Without error bars came {' and '.join(bare)}: calibrate with kcal, or import a file that has them"
@@ -102,8 +101,7 @@ def print_rig(result: rooms.RigResult, lines: list[str]) -> None:
     for line in lines:
         print_styled(line, r"(?<=^RMS )\S+ px|(?<=^baseline ).+")
     for turned in result.flipped:
-        text = f"turned by 180°: {turned.board} ({turned.camera}; the board was read from its other end)"
-        out.print(text)
+        out.print(f"turned by 180°: {turned.board} ({turned.camera}; the board was read from its other end)")
     for source in dict.fromkeys(item.source for item in result.left_out):
         gone = [item for item in result.left_out if item.source == source]
         for item in gone[:_MOST_NAMED]:
@@ -174,11 +172,9 @@ def solve_and_write(
     tell(rms_px=result.rms, warnings=console.told.get("warnings", []), left_out=left_out)
     print_rig(result, [*lines, *read.told(result)])
     kcal.save_rig(rig, output)
-    if picture is not None:
-        kcal.report.save_picture(picture, kcal.report.rig_figure(result))
+    console.draw_picture(picture, lambda: kcal.report.rig_figure(result))
     if two:
-        baseline = float(rig.baseline)
-        tell(baseline_m=baseline, baseline_sigma_m=result.sigma_baseline, pairs=list(result.pairs))
+        tell(baseline_m=float(rig.baseline), baseline_sigma_m=result.sigma_baseline, pairs=list(result.pairs))
         _print_ranges(rig, noise, note)
     else:
         tell(undetermined=list(result.undetermined))
@@ -235,10 +231,7 @@ _OF_ONE = (
 
 
 def station_command(
-    camera: kinds.CalibratedCamera,
-    *,
-    output: kinds.NewFile,
-    sources: Annotated[Sources, Only(_OF_ONE)],
+    camera: kinds.CalibratedCamera, *, output: kinds.NewFile, sources: Annotated[Sources, Only(_OF_ONE)]
 ) -> None:
     """Solve how one camera stands on the Earth: position, heading, pitch and roll, with error bars.
 
@@ -491,7 +484,9 @@ def rig_check_command(
     surveyed = None if landmarks is None else _landmarks(old, landmarks, now, noise)
     drift = kcal.rig.check_rig(old, features=features, landmarks=surveyed)
     print_turns(drift, f"{sum(item.used for item in drift.items)} of {len(drift.items)}")
-    _print_effect(drift)
+    for distance, found, sigma in zip(*(value.tolist() for value in drift.effect()), strict=True):
+        shift = "infinity" if math.isinf(found) else f"{found:.1f} m ({found - distance:+z.1f} ± {sigma:.1f} m)"
+        out.print(f"with the old rig a target at {distance:g} m is found at {shift}")
     for item in drift.left_out:
         print_label("left out", f"{item.name}: {item.reason}")
     if drift.variance > 1:
@@ -526,12 +521,6 @@ def print_turns(drift: rooms.Drift, used: str = "") -> None:
         cells = [f"{math.degrees(value):+z.5f} ± {math.degrees(sigma):.5f}" for value, sigma in both]
         rows.append([name, *cells, *([used] if used else [])])
     print_table(rows, left=range(len(rows[0])))
-
-
-def _print_effect(drift: rooms.Drift) -> None:
-    for distance, found, sigma in zip(*(value.tolist() for value in drift.effect()), strict=True):
-        shift = "infinity" if math.isinf(found) else f"{found:.1f} m ({found - distance:+z.1f} ± {sigma:.1f} m)"
-        out.print(f"with the old rig a target at {distance:g} m is found at {shift}")
 
 
 def now_stamp() -> str:

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import kcal
 from kcal.cli import kinds, rooms
-from kcal.cli.console import aligned, ending_with, look_at_views, mark_again, steps, warn, with_command
+from kcal.cli.console import aligned, draw_picture, ending_with, look_at_views, mark_again, steps, warn, with_command
 from kcal.cli.inputs import pixel_sigma_and_source, typed_with
 from kcal.cli.options import Kind, Rare, Several
 from kcal.cli.stars import Night
@@ -347,10 +347,8 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
             images, list(read.cameras.values()), kcal.locate.terrain(raster, given.geoid or 0.0), read.origin,
             centers, sigma, error=error,
         )  # fmt: skip
-    if given.skyline_picture is not None:
-        kcal.report.save_picture(
-            given.skyline_picture, rooms.skyline_figure([(image.name, image.image) for image in images], found)
-        )
+    shown = [(image.name, image.image) for image in images]
+    draw_picture(given.skyline_picture, lambda: rooms.skyline_figure(shown, found))
     read.notes += [line for image, one in zip(images, found, strict=True) for line in _lines(image, names, one)]
     warn(*(f"skyline {image.name}: {text}" for image, one in zip(images, found, strict=True) for text in one.warnings))
     read.add("skyline", source)
@@ -417,16 +415,12 @@ def check_views_of(cameras: Sequence[kcal.Camera], seen: Sequence[kcal.Observati
         )
     for camera, views, path in zip(cameras, seen, paths, strict=True):
         if camera.size != views.image_size:
-            raise InputError(_other_size(camera, views, path))
-
-
-def _other_size(camera: kcal.Camera, views: kcal.Observations, path: Path) -> str:
-    name = camera.calibration.name if camera.calibration else ""
-    return (
-        f"{path}: images of {views.image_size[0]}x{views.image_size[1]} px, but the camera {name or 'given'} has "
-        f"{camera.size[0]}x{camera.size[1]} px: these are not its views. To calibrate from them: "
-        f"kcal calibrate {path} -o {path.name.split('.')[0]}.camera.json"
-    )
+            name = camera.calibration.name if camera.calibration else ""
+            raise InputError(
+                f"{path}: images of {views.image_size[0]}x{views.image_size[1]} px, but the camera {name or 'given'} "
+                f"has {camera.size[0]}x{camera.size[1]} px: these are not its views. To calibrate from them: "
+                f"kcal calibrate {path} -o {path.name.split('.')[0]}.camera.json"
+            )
 
 
 def _exchanged(paths: Sequence[Path]) -> str:

@@ -153,15 +153,7 @@ def view_command(
     if not pair:
         refuse_of_pairs(options)
     localize = pair_localizer(solved, options, noise)(solved) if pair else kcal.Localizer(solved, pixel_sigma=noise)
-    scene: list[Any] = []
-    for file in files or []:
-        kind = file_kind(file)
-        if kind == "image":
-            scene.append(rooms.view_image(file))
-        elif kind == "observations":
-            scene.append(kcal.Observations.load(file))
-        else:
-            scene.append(_of_table(file, kind, localize, note))
+    scene = [_thing(file, localize, note) for file in files or ()]
     kcal.report.save_view(output, localize, *scene, reach=reach)
     print_wrote(output)
     if open_:
@@ -181,8 +173,13 @@ def _rig_of(source: str) -> kcal.Rig:
     return kcal.Rig([camera], [name or path.name.split(".")[0]], rooms.torch.eye(3)[None], rooms.torch.zeros(1, 3))
 
 
-def _of_table(file: Path, kind: str, localize: kcal.Localizer, note: str) -> rooms.Located | kcal.rig.Survey:
-    """Positions as they were written, marks or a detector's lines as they are located now, or landmarks."""
+def _thing(file: Path, localize: kcal.Localizer, note: str) -> Any:
+    """Image, observations, positions as they were written, marks or a detector's lines as located now, or landmarks."""
+    kind = file_kind(file)
+    if kind == "image":
+        return rooms.view_image(file)
+    if kind == "observations":
+        return kcal.Observations.load(file)
     locate = rooms.PointLocator(localize)
     lines = kind in ("foreign", "json")
     if not lines and "status" in rooms.header_of(file):

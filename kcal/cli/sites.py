@@ -9,7 +9,7 @@ from typing import Annotated
 
 import kcal
 from kcal.cli import kinds, rooms
-from kcal.cli.console import out, print_table, print_wrote, steps, tell, warn
+from kcal.cli.console import draw_picture, out, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import pixel_sigma_of
 from kcal.cli.options import Kind
 from kcal.cli.stars import print_star_budget
@@ -87,7 +87,14 @@ def sites_command(
         warn(f"the terrain has no heights in {100 * unknown:.1f} % of the area, which is left out")
     if bool(field.surface.up.isnan().any()):
         warn("the terrain has no heights in some places between sites and area: nothing is taken to be hidden by them")
-    _print_towers(now)
+    two = now.seen_by > 1
+    some = length_text(float(now.sigma[two].median()), digits=2) if bool(two.any()) else "nowhere known"
+    alone = float((now.seen_by == 1).double().mean())
+    out.print(
+        f"two towers or more see {100 * now.covered:.0f} % of the area, one {100 * alone:.0f} %; median standard "
+        f"deviation of positions where two do: {some}; over the whole area, where what nobody sees may be anywhere in "
+        f"it: {length_text(now.mean_sigma, digits=3)}"
+    )
     table = _ranked_table(ranked)
     if ranked:
         print_table(table.cells)
@@ -100,20 +107,8 @@ def sites_command(
         out.print(f"with the chosen: {length_text(later.mean_sigma, digits=3)}, {100 * later.covered:.0f} % covered")
     if output is not None:
         write_atomic(output, _map_text(field, now, later))
-    if picture is not None:
-        kcal.report.save_picture(picture, rooms.siting_figure(field, standing, ranked))
+    draw_picture(picture, lambda: rooms.siting_figure(field, standing, ranked))
     print_wrote(output, picture)
-
-
-def _print_towers(now: rooms.SitingMap) -> None:
-    two = now.seen_by > 1
-    some = length_text(float(now.sigma[two].median()), digits=2) if bool(two.any()) else "nowhere known"
-    one = float((now.seen_by == 1).double().mean())
-    out.print(
-        f"two towers or more see {100 * now.covered:.0f} % of the area, one {100 * one:.0f} %; median standard "
-        f"deviation of positions where two do: {some}; over the whole area, where what nobody sees may be anywhere in "
-        f"it: {length_text(now.mean_sigma, digits=3)}"
-    )
 
 
 def _ranked_table(ranked: list[rooms.RankedSite]) -> Table:

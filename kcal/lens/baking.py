@@ -51,12 +51,10 @@ class Spline(NamedTuple):
 
 def filter_nodes(values: Tensor) -> Tensor:
     """Compute coefficients (..., R - 4, C - 4) from values (..., R, C) at the same places."""
-    rows, columns = values.shape[-2] - 4, values.shape[-1] - 4
-    along = sum(weight * values[..., k : k + columns] for k, weight in enumerate(_FILTER))
-    assert isinstance(along, Tensor)
-    down = sum(weight * along[..., k : k + rows, :] for k, weight in enumerate(_FILTER))
-    assert isinstance(down, Tensor)
-    return down
+    for axis in (-1, -2):
+        parts = [weight * values.narrow(axis, k, values.shape[axis] - 4) for k, weight in enumerate(_FILTER)]
+        values = sum(parts, values.new_zeros(()))
+    return values
 
 
 def extend_nodes(values: Tensor, known: Tensor, rings: int = 2 * RINGS) -> tuple[Tensor, Tensor]:

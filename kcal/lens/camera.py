@@ -358,9 +358,7 @@ class Camera(ConvertibleCamera):
     def covers_image(self) -> Tensor:
         """Whether every pixel of the image has a ray, (...); checked along the border of the image."""
         grid = self.grid(17, 13)
-        border = torch.cat([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
-        _, valid = self.unproject(border)
-        return valid.all(-1)
+        return self.unproject(torch.cat([grid[0], grid[-1], grid[:, 0], grid[:, -1]]))[1].all(-1)
 
     def forward(self, points_cam: Tensor | ArrayLike) -> tuple[Tensor, Tensor]:
         """The same as `project`."""

@@ -101,8 +101,7 @@ class AdaptedCamera(Float64Module):
     def center(self) -> Tensor:
         """(2,) the pixel of the optical axis; the middle of the image if the axis has none."""
         pixel, valid = self.camera.project(self.params.new_tensor([[0.0, 0.0, 1.0]]))
-        middle = 0.5 * (self.params.new_tensor(self.size) - 1.0)
-        return torch.where(valid[:, None], pixel, middle)[0]
+        return torch.where(valid[:, None], pixel, 0.5 * (self.params.new_tensor(self.size) - 1.0))[0]
 
     @property
     def fingerprint(self) -> str:
@@ -198,10 +197,8 @@ def camera_stack(cameras: Sequence[Camera]) -> CameraStack:
     """Put cameras together, once for many calls while they stay as they are."""
     if not stackable(cameras):
         return CameraStack(cameras, None, None)
-    regions = zip(*(camera.valid_region for camera in cameras), strict=True)
-    ready = PreparedInverse(
-        Region(*(torch.stack(parts) for parts in regions)), torch.stack([camera.inverse_start for camera in cameras])
-    )
+    region = Region(*map(torch.stack, zip(*(camera.valid_region for camera in cameras), strict=True)))
+    ready = PreparedInverse(region, torch.stack([camera.inverse_start for camera in cameras]))
     return CameraStack(cameras, torch.stack([camera.values for camera in cameras]), ready)
 
 
@@ -223,6 +220,10 @@ def unproject_each(cameras: Sequence[Camera] | CameraStack, pixels: Tensor) -> t
     return torch.stack(rays_from_plane(x, y, model), -1), valid
 
 
+# Where the axis of the cameras goes in pixels, derivatives by point and by camera, and validity.
+_CAMERAS = (-3, -4, -4, -2)
+
+
 def project_each(
     cameras: Sequence[Camera], points: Tensor, wanted: Sequence[Sequence[int]], meter: Tensor
 ) -> list[Projection]:
@@ -235,11 +236,9 @@ def project_each(
             for number, camera in enumerate(cameras)
         ]
     values = torch.stack([camera.values for camera in cameras])
-    pixels, by_point, by_camera, regular, *_ = project_components(points, values, cameras[0].model, wanted[0])
-    return [
-        Projection(*parts)
-        for parts in zip(pixels.unbind(-3), by_point.unbind(-4), by_camera.unbind(-4), regular.unbind(-2), strict=True)
-    ]
+    found = project_components(points, values, cameras[0].model, wanted[0])
+    parts = (part.unbind(axis) for part, axis in zip(found[:4], _CAMERAS, strict=True))
+    return list(map(Projection, *parts))
 
 
 def project_stack(stack: CameraStack, points: Tensor, wanted: Sequence[Sequence[int]], meter: Tensor) -> Projection:
@@ -247,23 +246,18 @@ def project_stack(stack: CameraStack, points: Tensor, wanted: Sequence[Sequence[
     if stack.values is not None:
         return project_components(points, stack.values, stack.cameras[0].model, wanted[0])
     most = max(map(len, wanted))
-    each = project_each(stack.cameras, points, wanted, meter)
-    columns = [
-        torch.nn.functional.pad(one.by_camera, (0, 0, 0, 0, 0, most - len(own)))
-        for one, own in zip(each, wanted, strict=True)
+    each = [
+        one._replace(by_camera=torch.nn.functional.pad(one.by_camera, (0, 0, 0, 0, 0, most - len(own))))
+        for one, own in zip(project_each(stack.cameras, points, wanted, meter), wanted, strict=True)
     ]
     rates = None
     if any(one.by_meter is not None for one in each):
         rates = torch.stack(
             [torch.zeros_like(one.pixels) if one.by_meter is None else one.by_meter for one in each], -3
         )
-    return Projection(
-        torch.stack([one.pixels for one in each], -3),
-        torch.stack([one.by_point for one in each], -4),
-        torch.stack(columns, -4),
-        torch.stack([one.regular for one in each], -2),
-        rates,
-    )
+    columns = zip(*(one[:4] for one in each), strict=True)
+    pixels, by_point, by_camera, regular = map(torch.stack, columns, _CAMERAS)
+    return Projection(pixels, by_point, by_camera, regular, rates)
 
 
 # The ray of every pixel: as the `forward` of a module, and for renderers that take rays in place of a camera model.
@@ -401,10 +395,7 @@ class CameraRays(Float64Module):
                 raise InputError("viewmats: the left part of a matrix is no rotation; scales belong into the scene")
             turn, shift = rotation[..., None, None, :, :], translation[..., None, None, :]
             # Row vectors times R are Rᵀ v: from the camera to the world.
-            moved = (
-                ((origins - shift)[..., None, :] @ turn)[..., 0, :],
-                (directions[..., None, :] @ turn)[..., 0, :],
-            )
+            moved = (((origins - shift)[..., None, :] @ turn)[..., 0, :], (directions[..., None, :] @ turn)[..., 0, :])
             rays = torch.cat(moved, -1)
         return torch.where(mask[..., None], rays, 0.0).to(dtype)
 

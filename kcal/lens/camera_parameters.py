@@ -48,8 +48,7 @@ class LensParameters(Operations, StatedModule):
         parameters = as_points(what, parameters, len(self.names))
         require_finite(what, parameters)
         self.params = nn.Parameter(parameters.detach().clone(), requires_grad=False)
-        free = torch.ones(len(self.names), dtype=torch.bool, device=parameters.device)
-        self.register_buffer("free_mask", free)
+        self.register_buffer("free_mask", torch.ones(len(self.names), dtype=torch.bool, device=parameters.device))
 
     def _measure_region(self) -> None:
         """Register what follows from the parameters, and so is not part of the saved state."""
@@ -106,8 +105,7 @@ class LensParameters(Operations, StatedModule):
             ['fx', 'k1']
         """
         known = self.names if self.field is None else (*self.names, "field")
-        unknown = [name for name in names if name not in known]
-        if unknown:
+        if unknown := [name for name in names if name not in known]:
             raise InputError(f"unknown parameter {unknown[0]!r}: there are {', '.join(known)}")
         chosen = names or tuple(name for name in known if name != "skew")
         with torch.no_grad():

@@ -11,6 +11,7 @@ from torch import Tensor
 from kcal.checks import chi2_tail
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
+from kcal.lens.information import CameraInformation
 from kcal.lens.pose import fit_turn, rotation_between, seen_turned
 from kcal.lens.projection import FAR
 from kcal.lens.uncertainty import largest_sigma, pixel_covariance, pixel_slopes
@@ -167,7 +168,7 @@ def camera_difference(
         pixels=pixels,
         shift=away.reshape(pixels.shape),
         sigma=None if sigma is None else sigma.reshape(pixels.shape[:2]),
-        known=(_has_errors(first), _has_errors(second)),
+        known=(_known_errors(first) is not None, _known_errors(second) is not None),
         rotation=turn,
         translation=shift,
         at=at,
@@ -176,16 +177,16 @@ def camera_difference(
     )
 
 
-def _has_errors(camera: Camera) -> bool:
+def _known_errors(camera: Camera) -> CameraInformation | None:
     known = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
-    return known is not None and known.lens_size > 0
+    return known if known is not None and known.lens_size > 0 else None
 
 
 def _inverse_variances(first: Camera, second: Camera, pixels: Tensor, good: Tensor) -> Tensor:
     """(N,) inverse variances with mean one, zero where a camera has no ray."""
     variance = torch.zeros_like(pixels[:, 0])
     for camera in (first, second):
-        if _has_errors(camera):
+        if _known_errors(camera) is not None:
             variance = variance + 0.5 * pixel_covariance(camera, pixels).diagonal(dim1=-2, dim2=-1).sum(-1)
     good = good & variance.isfinite()
     typical = torch.maximum(variance[good].median(), 1e-6 * variance[good].max())
@@ -214,23 +215,14 @@ def _fit(
 
 
 def _judged(
-    first: Camera,
-    second: Camera,
-    places: tuple[Tensor, Tensor],
-    away: Tensor,
-    weight: Tensor,
-    at: float,
-    freedom: int,
+    first: Camera, second: Camera, places: tuple[Tensor, Tensor], away: Tensor, weight: Tensor, at: float, freedom: int
 ) -> tuple[Tensor | None, float | None, float | None]:
     """Sigma (N,) of the shift, its RMS over what is expected, and the probability of as large a shift by chance."""
     roots = []
     root = weight.sqrt()[:, None, None]
     for camera, here in zip((first, second), places, strict=True):
-        if not _has_errors(camera):
+        if (known := _known_errors(camera)) is None:
             continue
-        assert camera.calibration is not None
-        known = camera.calibration.known(camera.params.detach())
-        assert known is not None
         wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
         by_camera, by_motion, good = pixel_slopes(camera, here, at, wanted)
         by_camera = torch.where(good[:, None, None], by_camera, 0.0)
@@ -254,8 +246,7 @@ def _judged(
     # The weighted sum of squares of normal errors has nearly a scaled χ² distribution (Satterthwaite 1946).
     scale, degrees = squared / expected, expected**2 / squared
     probability = float(chi2_tail(found / scale, degrees))
-    sigma = torch.where(weight > 0, sigma, torch.nan)
-    return sigma, math.sqrt(found / expected), probability
+    return torch.where(weight > 0, sigma, torch.nan), math.sqrt(found / expected), probability
 
 
 def difference_text(found: CameraDifference) -> list[str]:
@@ -270,9 +261,7 @@ def difference_text(found: CameraDifference) -> list[str]:
         lines[-1] += f" and a shift by {length_text(float(found.translation.norm()))}"
     if found.ratio is None or found.probability is None or spread is None or typical is None:
         return [*lines, "no error bars in either file: whether this is more than their uncertainty cannot be said"]
-    whose = {(True, True): "both cameras", (True, False): "the first camera alone"}.get(
-        found.known, "the second camera alone"
-    )
+    whose = "both cameras" if all(found.known) else f"the {'first' if found.known[0] else 'second'} camera alone"
     explained = (
         f"{number_text(found.ratio)} times what they predict, as large by chance with probability "
         f"{number_text(found.probability, digits=2)}"

@@ -9,7 +9,7 @@ import hashlib
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -40,40 +40,48 @@ class WeightPrior(NamedTuple):
     degree: float
 
 
-class FieldModes(Protocol):
+class FieldModes:
     """Features of a field on the unit disc, each a smooth displacement (f, g) of the place (x, y).
+
+    Those of units have one weight along x and one along y for each unit, those along x first.
 
     Attributes:
         names: of the weights.
-        radial_names: names of those whose field is symmetric about the axis.
-        hyperprior: mean, standard deviation and largest value of the natural logarithm of each hyperparameter.
-        weight_priors: of each weight.
-        peaks: largest displacement by each feature on the disc, to order of magnitude.
     """
 
-    @property
-    def names(self) -> tuple[str, ...]: ...  # noqa: D102
-
-    @property
-    def radial_names(self) -> frozenset[str]: ...  # noqa: D102
-
-    @property
-    def hyperprior(self) -> tuple[tuple[float, float, float], ...]: ...  # noqa: D102
-
-    @property
-    def weight_priors(self) -> Sequence[WeightPrior]: ...  # noqa: D102
-
-    @property
-    def peaks(self) -> Sequence[float]: ...  # noqa: D102
+    names: tuple[str, ...]
 
     def __len__(self) -> int:
         """Number of weights."""
+        return len(self.names)
+
+    @property
+    def radial_names(self) -> frozenset[str]:
+        """Names of those whose field is symmetric about the axis: no unit is."""
+        return frozenset()
+
+    @property
+    def hyperprior(self) -> tuple[tuple[float, float, float], ...]:
+        """Mean, standard deviation and largest value of the natural logarithm of each hyperparameter."""
+        raise NotImplementedError
+
+    @property
+    def weight_priors(self) -> tuple[WeightPrior, ...]:
+        """Of each weight."""
+        raise NotImplementedError
+
+    @property
+    def peaks(self) -> tuple[float, ...]:
+        """Largest displacement by each feature on the disc, to order of magnitude: one for units."""
+        return (1.0,) * len(self)
 
     def columns(self, x: Tensor, y: Tensor) -> Tensor:
         """Evaluate each feature at places (x, y) (..., N) of the unit disc: (M, 2, ..., N)."""
+        raise NotImplementedError
 
     def fill_columns(self, out: Tensor, x: Tensor, y: Tensor, scale: Tensor) -> None:
         """Write `columns` times a scale (..., 2, N) into memory (M, ..., 2, N); nothing is differentiated."""
+        torch.mul(self.columns(x, y).movedim(1, -2), scale, out=out)
 
     def field(self, weights: Tensor, x: Tensor, y: Tensor, slopes: bool = True) -> tuple[Tensor, ...]:
         """Evaluate the weighted sum: the displacement (f, g), and if wanted its slopes f_x, f_y, g_x, g_y.
@@ -87,38 +95,7 @@ class FieldModes(Protocol):
         Returns:
             Two or six tensors (..., N).
         """
-
-
-class UnitModes:
-    """What fields of scalar units have in common, which have one weight along x and one along y for each unit.
-
-    Attributes:
-        names: of the weights, those along x first.
-    """
-
-    names: tuple[str, ...]
-
-    def __len__(self) -> int:
-        """Number of weights."""
-        return len(self.names)
-
-    @property
-    def radial_names(self) -> frozenset[str]:
-        """See `FieldModes`: no unit is symmetric about the axis."""
-        return frozenset()
-
-    @property
-    def peaks(self) -> tuple[float, ...]:
-        """See `FieldModes`."""
-        return (1.0,) * len(self)
-
-    def columns(self, x: Tensor, y: Tensor) -> Tensor:
-        """See `FieldModes`."""
         raise NotImplementedError
-
-    def fill_columns(self, out: Tensor, x: Tensor, y: Tensor, scale: Tensor) -> None:
-        """See `FieldModes`."""
-        torch.mul(self.columns(x, y).movedim(1, -2), scale, out=out)
 
 
 def vector_columns(values: Tensor) -> Tensor:
@@ -158,7 +135,7 @@ class _Grid(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class GaussianModes(UnitModes):
+class GaussianModes(FieldModes):
     """Gaussian units on square grids over the unit disc (`FieldModes`).
 
     The weights along x come first, the widest units first, then those along y. Their prior has one amplitude, and one
@@ -279,7 +256,7 @@ SLOPES: dict[type[nn.Module], Callable[[Tensor, Tensor], Tensor]] = {
 }
 
 
-class NetworkModes(UnitModes):
+class NetworkModes(FieldModes):
     """The features of a network on the unit disc (`kcal.lens.field_modes.FieldModes`).
 
     The weights along x come first, then those along y. Their prior has one amplitude, and one decay per octave of the

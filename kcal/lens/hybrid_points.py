@@ -175,8 +175,7 @@ def _matrix(series: Mapping[int, np.ndarray]) -> Tensor:
         for k, weight in enumerate(part @ shifted_powers(len(part))):
             total += weight * _powers_of_z(max(j, 0) + k, max(-j, 0) + k, degree)
     # [power of y, u or v, power of x]
-    both = np.stack([total.real, total.imag], 1)
-    return torch.from_numpy(both.reshape(2 * (degree + 1), degree + 1))
+    return torch.from_numpy(np.stack([total.real, total.imag], 1).reshape(2 * (degree + 1), degree + 1))
 
 
 @functools.cache
@@ -315,8 +314,7 @@ class Backward(NamedTuple):
 
 def _planes(points: Tensor) -> tuple[Tensor, ...]:
     """The coordinates of points (n, K), each in its own memory; NumPy copies four times as fast."""
-    array = points.numpy()
-    return torch.from_numpy(np.ascontiguousarray(array.T)).unbind()
+    return torch.from_numpy(np.ascontiguousarray(points.numpy().T)).unbind()
 
 
 def _within(*limits: tuple[Tensor, float]) -> Tensor | None:
@@ -327,10 +325,7 @@ def _within(*limits: tuple[Tensor, float]) -> Tensor | None:
 
 
 def map_points(
-    polynomials: Forward | Backward,
-    formulas: Callable[[Tensor], tuple[Tensor, Tensor]],
-    points: Tensor,
-    width: int,
+    polynomials: Forward | Backward, formulas: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor, width: int
 ) -> tuple[Tensor, Tensor]:
     """Map points (..., N, K) to values (..., N, width) and valid (..., N): by `formulas` where not by `polynomials`."""
     flat = points.detach().reshape(-1, points.shape[-1])
@@ -389,9 +384,7 @@ class FittedPolynomials:
 
 def worth_fitting(points: Tensor, parameters: Tensor, model: LensModel) -> bool:
     """Whether polynomials may map these points (..., N, K), and are worth their fit."""
-    if is_traced() or model.hybrid is None or parameters.ndim > 1:
-        return False
-    if not isinstance(model.hybrid.modes, ZernikeModes):
+    if is_traced() or parameters.ndim > 1 or not (model.hybrid and isinstance(model.hybrid.modes, ZernikeModes)):
         return False
     on_host = points.device.type == "cpu" and parameters.device.type == "cpu"
     return on_host and points.numel() >= FEWEST * points.shape[-1] and may_overwrite(points, parameters)
@@ -512,8 +505,7 @@ def _forward_error(forward: Forward, parameters: Tensor, model: LensModel) -> fl
     across = 2.0 * torch.sqrt(square) / (1.0 + square) * distance
     X, Y, Z = across * torch.cos(turn), across * torch.sin(turn), (1.0 - square) / (1.0 + square) * distance
     pixels, found = forward(torch.stack([X, Y, Z], -1), X.new_empty((forward.rows, len(X))))
-    coefficients = parameters[len(INTRINSICS) :]
-    moved = ray_starts(X, Y, Z, coefficients).moved(X, Y, Z)
+    moved = ray_starts(X, Y, Z, parameters[len(INTRINSICS) :]).moved(X, Y, Z)
     return _largest_distance(*moved, pixels, found, parameters, model)
 
 
@@ -534,8 +526,7 @@ def _largest_distance(
     """Largest distance between pixels and those of rays by the formulas; infinite if few are found."""
     x, y = plane_from_points(X, Y, Z, model)
     lens = distort_components(x, y, parameters[len(INTRINSICS) :], model, slopes=False)
-    own = torch.stack(to_pixels(lens.x, lens.y, parameters), -1)
-    distance = torch.linalg.vector_norm(own - pixels, dim=-1)
+    distance = torch.linalg.vector_norm(torch.stack(to_pixels(lens.x, lens.y, parameters), -1) - pixels, dim=-1)
     if found is not None:
         if float(found.double().mean()) < 0.9:
             return math.inf

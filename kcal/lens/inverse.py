@@ -122,8 +122,7 @@ def start_from(x: Tensor, y: Tensor, model: LensModel, start: Tensor) -> tuple[T
     if not (model.numerator or model.denominator or model.hybrid):
         return x, y
     largest, constant, *rest = unbind_last(start)
-    square = torch.addcmul(x * x, y, y)
-    variable = 2.0 * torch.sqrt(torch.clamp(1.0 - square / largest, min=0.0)) - 1.0
+    variable = 2.0 * torch.sqrt(torch.clamp(1.0 - torch.addcmul(x * x, y, y) / largest, min=0.0)) - 1.0
     ratio, _ = polynomial(variable, rest, 0.0, False)
     ratio = ratio + constant
     return x * ratio, y * ratio
@@ -172,7 +171,6 @@ def solve_safeguarded(
     valid: Tensor,
     target_x: Tensor,
     target_y: Tensor,
-    tolerance: Tensor,
     coefficients: Tensor,
     model: LensModel,
     region: Region,
@@ -185,7 +183,6 @@ def solve_safeguarded(
         valid: (..., N), where they are the solution.
         target_x: distorted coordinates, broadcast against x.
         target_y: like target_x.
-        tolerance: largest squared residual of a solution.
         coefficients: (..., P).
         model: the lens model.
         region: of the lens.
@@ -194,8 +191,8 @@ def solve_safeguarded(
     shape = np.broadcast_shapes(valid.shape, (*coefficients.shape[:-1], valid.shape[-1]))
     lead, count = shape[:-1], shape[-1]
     cameras = torch.Size(lead).numel()
-    x, y, valid, target_x, target_y, tolerance = (
-        value.expand(shape).reshape(cameras, count) for value in (x, y, valid, target_x, target_y, tolerance)
+    x, y, valid, target_x, target_y = (
+        value.expand(shape).reshape(cameras, count) for value in (x, y, valid, target_x, target_y)
     )
     lenses = coefficients.expand(*lead, model.size).reshape(cameras, model.size)
     radius = region.radius.expand(lead).reshape(cameras)
@@ -219,16 +216,16 @@ def solve_safeguarded(
     for c, n in zip(camera.split(1024), place.split(1024), strict=True):
         # Where there are several lenses, each point has its own, and its own dimension of length one.
         tail = (-1, 1) if cameras > 1 else (-1,)
-        goal_x, goal_y, enough = (value[c, n].reshape(tail) for value in (target_x, target_y, tolerance))
+        goal_x, goal_y = (value[c, n].reshape(tail) for value in (target_x, target_y))
         lens = lenses[c] if cameras > 1 else lenses[0]
         here = Region(radius[c], edges[c], cuts[c]) if cameras > 1 else Region(radius[0], edges[0], cuts[0])
         distances = (image_x[c] - goal_x.reshape(-1, 1)) ** 2 + (image_y[c] - goal_y.reshape(-1, 1)) ** 2
         nearest = distances.argmin(-1)
         start_x, start_y = (value[c, nearest].reshape(tail) for value in (sample_x, sample_y))
-        part: tuple[Tensor, ...] = _damped_newton(start_x, start_y, goal_x, goal_y, enough, lens, model, here)
+        part: tuple[Tensor, ...] = _damped_newton(start_x, start_y, goal_x, goal_y, lens, model, here)
         if not known_true(part[2] | (outward[c, n] > _TRIED_AGAIN).reshape(tail)):
             start_x, start_y = _follow_line(goal_x, goal_y, lens, model)
-            led = _damped_newton(start_x, start_y, goal_x, goal_y, enough, lens, model, here)
+            led = _damped_newton(start_x, start_y, goal_x, goal_y, lens, model, here)
             part = tuple(torch.where(part[2], old, new) for old, new in zip(part, led, strict=True))
         found.append(part)
     solved = [torch.cat([part[i].reshape(-1) for part in found]) for i in range(3)]
@@ -238,15 +235,13 @@ def solve_safeguarded(
     return x, y, valid
 
 
-def _images(points: Tensor, lenses: Tensor, model: LensModel) -> tuple[Tensor, Tensor]:
+def _images(points: Tensor, lenses: Tensor, model: LensModel) -> tuple[Tensor, ...]:
     """Images x, y (cameras, N) of points (cameras, N, 2) of each region."""
     lens = distort_components(points[..., 0], points[..., 1], lenses, model)
     regular = lens.positive & (lens.determinant > 0)
     # Images that are no part of the lens: far enough never to be the nearest, and still finite when squared.
-    image_x, image_y = (
-        torch.where(regular, value, _FAR).clamp(-_FAR, _FAR).nan_to_num(_FAR) for value in (lens.x, lens.y)
-    )
-    return image_x, image_y
+    both = torch.where(regular, torch.stack([lens.x, lens.y]), _FAR)
+    return both.clamp(-_FAR, _FAR).nan_to_num(_FAR).unbind()
 
 
 def _edge_fraction(x: Tensor, y: Tensor, edge_x: Tensor, edge_y: Tensor) -> Tensor:
@@ -285,16 +280,10 @@ def _follow_line(target_x: Tensor, target_y: Tensor, coefficients: Tensor, model
 
 
 def _damped_newton(
-    x: Tensor,
-    y: Tensor,
-    target_x: Tensor,
-    target_y: Tensor,
-    tolerance: Tensor,
-    coefficients: Tensor,
-    model: LensModel,
-    region: Region,
+    x: Tensor, y: Tensor, target_x: Tensor, target_y: Tensor, coefficients: Tensor, model: LensModel, region: Region
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Newton steps, halved until they lower the residual and stay in the region: x, y, and whether they solve it."""
+    tolerance = squared_tolerance(target_x, target_y)
 
     def evaluate(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         lens = distort_components(x, y, coefficients, model)
@@ -466,8 +455,7 @@ def _solve_eagerly(
     valid = valid & in_region(x, y, coefficients, model, ready.region)
     if known_true(valid):
         return x, y, valid
-    tolerance = squared_tolerance(target_x, target_y)
-    return solve_safeguarded(x, y, valid, target_x, target_y, tolerance, coefficients, model, ready.region)
+    return solve_safeguarded(x, y, valid, target_x, target_y, coefficients, model, ready.region)
 
 
 def _solve_in_fixed_steps(

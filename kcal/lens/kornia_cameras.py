@@ -73,9 +73,8 @@ def parameters_from_kornia(camera: Any) -> tuple[Tensor, tuple[int, int], LensMo
                 "and give a PinholeCamera whose extrinsics are the identity"
             )
         values = torch.stack([matrix[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2), (0, 1))], -1)
-        return values[0] if len(values) == 1 else values, _one_size(camera.width, camera.height), LensModel.named(
-            "pinhole"
-        )  # fmt: skip
+        size = _one_size(camera.width, camera.height)
+        return values[0] if len(values) == 1 else values, size, PRESETS["pinhole"]
     distortion, projection = getattr(camera, "distortion", None), getattr(camera, "projection", None)
     if type(distortion) not in _MODELS or not isinstance(projection, Z1Projection):
         raise InputError(f"from_kornia: a perspective or Kannala-Brandt camera of kornia is needed, got {camera!r}")

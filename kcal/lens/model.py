@@ -172,10 +172,9 @@ class HybridForm:
         object.__setattr__(self, "leading", LEADING + PORT * self.port)
         object.__setattr__(self, "names", self.leading + self.modes.names)
 
-    def constants(self, like: Tensor) -> tuple[Tensor, Tensor]:
+    def constants(self, like: Tensor) -> tuple[Tensor, ...]:
         """s₀ and 1 / ρ as tensors on the device of `like`: ONNX would write plain numbers as float32."""
-        shape, inverse = torch.tensor((self.shape, 1.0 / self.radius), dtype=like.dtype, device=like.device).unbind()
-        return shape, inverse
+        return torch.tensor((self.shape, 1.0 / self.radius), dtype=like.dtype, device=like.device).unbind()
 
     @property
     def radial_names(self) -> frozenset[str]:
@@ -219,8 +218,7 @@ def hybrid_terms(
         lead = torch.stack([by_bend * x, by_bend * y], -2)[..., None, :, :]
         columns = torch.cat([lead, torch.zeros_like(lead).expand(*(-1,) * (lead.ndim - 3), offset - 1, -1, -1)], -3)
         if max(wanted) >= offset:
-            fields = form.modes.columns(x * to_disc, y * to_disc).movedim((0, 1), (-3, -2))
-            columns = torch.cat([columns, fields], -3)
+            columns = torch.cat([columns, form.modes.columns(x * to_disc, y * to_disc).movedim((0, 1), (-3, -2))], -3)
         if list(wanted) != list(range(columns.shape[-3])):
             columns = columns[..., list(wanted), :, :]
     else:
@@ -477,13 +475,7 @@ def polynomial(s: Tensor, coefficients: Sequence[Tensor], constant: float, slope
 
 
 def distort_components(
-    x: Tensor,
-    y: Tensor,
-    coefficients: Tensor,
-    model: LensModel,
-    wanted: Sequence[int] = (),
-    *,
-    slopes: bool = True,
+    x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel, wanted: Sequence[int] = (), *, slopes: bool = True
 ) -> Distorted:
     """Distort separate coordinates x, y (..., N), with the derivatives that are asked for.
 
@@ -536,7 +528,7 @@ def distort_components(
             a, e = torch.add(a + shear, p2x, alpha=4.0), torch.add(e + shear, p1y, alpha=4.0)
             point = (a, b + turn, d + turn, e)
 
-    columns = _coefficient_columns(x, y, s, xx, xy, yy, g, inverse, model, wanted)
+    columns = _coefficient_columns((x, y, s, xx, xy, yy), g, inverse, model, wanted)
     if not model.tilt:
         return Distorted(u, v, point, as_columns([pair for pair in columns if pair is not None], u), positive)
 
@@ -580,20 +572,12 @@ def as_columns(pairs: Sequence[tuple[Tensor, Tensor]], like: Tensor) -> Tensor:
 
 
 def _coefficient_columns(
-    x: Tensor,
-    y: Tensor,
-    s: Tensor,
-    xx: Tensor,
-    xy: Tensor,
-    yy: Tensor,
-    g: Tensor,
-    inverse: Tensor,
-    model: LensModel,
-    wanted: Sequence[int],
+    plane: tuple[Tensor, ...], g: Tensor, inverse: Tensor, model: LensModel, wanted: Sequence[int]
 ) -> list[tuple[Tensor, Tensor] | None]:
-    """Derivatives by the wanted coefficients, before the tilt; None stands for a tilt angle."""
+    """Derivatives by the wanted coefficients at x, y with their products, before the tilt; None: a tilt angle."""
     if not wanted:
         return []
+    x, y, s, xx, xy, yy = plane
     powers = [s]
     while len(powers) < max(model.numerator, model.denominator, model.prism):
         powers.append(powers[-1] * s)

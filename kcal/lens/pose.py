@@ -419,7 +419,7 @@ def fit_turn(
         >>> bool(torch.allclose(fit_turn(directions, look).rotation, wanted))
         True
     """
-    others, converged = torch.zeros(more, dtype=torch.float64), False
+    others = torch.zeros(more, dtype=torch.float64)
     for _ in range(steps):
         rows, residuals = look(rotation, others)
         rows, residuals = torch.where(residuals.isnan()[:, None], 0.0, rows), residuals.nan_to_num(0.0)
@@ -428,6 +428,5 @@ def fit_turn(
         step = -solution * min(1.0, longest / max(size, 1e-300))
         rotation, others = rotation_from_vector(step[:3]) @ rotation, others + step[3:]
         if size < settled:
-            converged = True
-            break
-    return TurnFit(rotation, others, converged)
+            return TurnFit(rotation, others, True)
+    return TurnFit(rotation, others, False)

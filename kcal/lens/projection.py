@@ -98,10 +98,7 @@ def plane_with_slopes(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
     depth = torch.where(near, Z, 1.0)
     nearby = series(_ARCTAN_SLOPE, torch.where(near, square / (depth * depth), 0.0)) / (depth * depth * depth)
     h = torch.where(near, nearby, (Z * by_distance - ratio) / torch.where(near, 1.0, square))
-    cross = X * Y * h
-    return (
-        ratio * X, ratio * Y, ratio + X * X * h, cross, ratio + Y * Y * h, -X * by_distance, -Y * by_distance,
-    )  # fmt: skip
+    return ratio * X, ratio * Y, ratio + X * X * h, X * Y * h, ratio + Y * Y * h, -X * by_distance, -Y * by_distance
 
 
 def _base_with_slopes(
@@ -255,9 +252,10 @@ def _depth_and_slope(square: Tensor, coefficients: Tensor, port: bool) -> tuple[
     return (first + (second + third * square) * square) * square, slope
 
 
-def about_axis(
-    X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, port: bool
-) -> tuple[Tensor, Tensor, tuple[Tensor, ...] | None]:
+_About = tuple[Tensor, Tensor, tuple[Tensor, ...] | None]
+
+
+def about_axis(X: Tensor, Y: Tensor, Z: Tensor, coefficients: Tensor, port: bool) -> _About:
     """ρ² of points (..., N) and their distance along the axis, and `Pupil.axis`, for a hybrid lens (..., P)."""
     if not port:
         return X * X + Y * Y, Z, None
@@ -278,11 +276,11 @@ def ray_starts(
 
     Two of Newton's steps are in the autograd graph; at a solution these have its exact first and second derivatives.
     """
-    across, ahead, axis = about_axis(X, Y, Z, coefficients, port)
+    about = about_axis(X, Y, Z, coefficients, port)
     with torch.no_grad():
-        depth = torch.zeros_like(ahead)
+        depth = torch.zeros_like(about[1])
         for _ in range(_STEPS):
-            wanted, pupil = _pupil_at(across, ahead, coefficients, depth, meter, axis)
+            wanted, pupil = _pupil_at(about, coefficients, depth, meter)
             step = (wanted - depth) * pupil.gain
             depth = depth + step
             found = pupil.found & (step * step <= _LAST_STEP**2 * (X * X + Y * Y + Z * Z))
@@ -290,7 +288,7 @@ def ray_starts(
                 break
     if is_differentiated(X, Y, Z, coefficients, meter if isinstance(meter, Tensor) else None):
         for _ in range(2):
-            wanted, pupil = _pupil_at(across, ahead, coefficients, depth, meter, axis)
+            wanted, pupil = _pupil_at(about, coefficients, depth, meter)
             depth = depth + (wanted - depth) * pupil.gain
     return pupil._replace(depth=depth, found=found)
 
@@ -310,19 +308,13 @@ def entrance_pupil(
 ) -> Pupil:
     """As `ray_starts`, with what closed-form derivatives need."""
     found = ray_starts(X, Y, Z, coefficients, meter, port=port)
-    across, ahead, axis = about_axis(X, Y, Z, coefficients, port)
-    return _pupil_at(across, ahead, coefficients, found.depth, meter, axis)[1]._replace(found=found.found)
+    about = about_axis(X, Y, Z, coefficients, port)
+    return _pupil_at(about, coefficients, found.depth, meter)[1]._replace(found=found.found)
 
 
-def _pupil_at(
-    across: Tensor,
-    ahead: Tensor,
-    coefficients: Tensor,
-    depth: Tensor,
-    meter: Tensor | float,
-    axis: tuple[Tensor, ...] | None,
-) -> tuple[Tensor, Pupil]:
+def _pupil_at(about: _About, coefficients: Tensor, depth: Tensor, meter: Tensor | float) -> tuple[Tensor, Pupil]:
     """The right side of the equation for a ray that starts at `depth`, to points of `about_axis`."""
+    across, ahead, axis = about
     below = ahead - depth
     ratio = _angle_over_root(across, below)
     square = ratio * ratio * across
@@ -372,9 +364,7 @@ class Projection(NamedTuple):
 
     def of(self, chosen: slice) -> Projection:
         """The same of some along the first dimension, which all have."""
-        meter, plane = (None if each is None else each[chosen] for each in (self.by_meter, self.plane))
-        pixels, by_point, by_camera, regular = (each[chosen] for each in self[:4])
-        return Projection(pixels, by_point, by_camera, regular, meter, plane)
+        return Projection(*(None if each is None else each[chosen] for each in self))  # type: ignore[arg-type]
 
 
 def to_pixels(x: Tensor, y: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
@@ -416,8 +406,7 @@ def project_components(
         moved = pupil.moved(X, Y, Z)
     x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(*moved, model)
     plane = torch.stack([x, y], -2) if model.hybrid and wanted is not None else None
-    lens_wanted = [i - offset for i in wanted or () if i >= offset]
-    lens = distort_components(x, y, parameters[..., offset:], model, lens_wanted)
+    lens = distort_components(x, y, parameters[..., offset:], model, [i - offset for i in wanted or () if i >= offset])
     fx, fy, _, _, skew = unbind_last(parameters[..., :offset])
     regular = lens.positive & (lens.determinant > 0)
     if pupil:
@@ -462,8 +451,7 @@ def project_components(
         by_lens = torch.stack([torch.addcmul(across * du, along, dv), down * dv], -2)
     # In the order of `wanted`: intrinsics come first as a rule.
     first = as_columns([intrinsic[i] for i in wanted if i < offset], pixels[..., 0, :])
-    whole = pixels.shape[:-2]
-    by_camera = torch.cat([part.expand(*whole, -1, -1, -1) for part in (first, by_lens)], -3)
+    by_camera = torch.cat([part.expand(*pixels.shape[:-2], -1, -1, -1) for part in (first, by_lens)], -3)
     order = sorted(range(len(wanted)), key=lambda k: wanted[k] >= offset)
     if order != list(range(len(wanted))):
         by_camera = by_camera[..., [order.index(k) for k in range(len(wanted))], :, :]

@@ -223,8 +223,7 @@ def valid_region(coefficients: Tensor, model: LensModel | str) -> Region:
     if not settled:
         region = _proven_part(coefficients, model, limits, region, single)
     # The disc in which no further check is needed must be proven, too.
-    smaller = positive < SURE * region.radius
-    return region._replace(radius=torch.where(smaller, positive / SURE, region.radius))
+    return region._replace(radius=torch.where(positive < SURE * region.radius, positive / SURE, region.radius))
 
 
 def _proven_part(coefficients: Tensor, model: LensModel, limits: Tensor, region: Region, single: Tensor) -> Region:
@@ -300,12 +299,7 @@ def sampled_region(coefficients: Tensor, model: LensModel, limits: Tensor, singl
 
 
 def in_region(
-    x: Tensor,
-    y: Tensor,
-    coefficients: Tensor,
-    model: LensModel,
-    region: Region,
-    lens: Distorted | None = None,
+    x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel, region: Region, lens: Distorted | None = None
 ) -> Tensor:
     """Whether points (..., N) of the plane lie in the valid region.
 
@@ -648,8 +642,7 @@ def _prove(bound: Callable[[_Cells, Span], Jet], reach: Tensor, disc: Tensor) ->
     every, signs, falling = zip(*done, strict=True)
     cells = _Cells(*(torch.cat(each) for each in zip(*every, strict=True)))
     sign, falls = torch.cat(signs), torch.cat(falling)
-    lowest = torch.where(sign <= 0, cells.low, torch.inf)
-    positive = reach.amax(-1).scatter_reduce(0, cells.lens, lowest, "amin")
+    positive = reach.amax(-1).scatter_reduce(0, cells.lens, torch.where(sign <= 0, cells.low, torch.inf), "amin")
     # A sign can change from negative to positive only in cells that remained undecided.
     cells = cells.take((sign == 0) & ~falls)
     row = torch.repeat_interleave(cells.lens * sectors + cells.sector, cells.width)

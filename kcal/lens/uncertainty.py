@@ -71,9 +71,8 @@ def pixel_covariance(
     wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
     half = known.by_parameter(known.half())[:, wanted]
     by_camera, by_motion, good = pixel_slopes(camera, camera.grid(*grid).reshape(-1, 2), math.inf, wanted)
-    by_turn = by_motion[..., :3]
     # The turn that best undoes each parameter's effect.
-    undo = torch.linalg.lstsq(by_turn[good].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
+    undo = torch.linalg.lstsq(by_motion[..., :3][good].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
     by_camera, by_motion, good = pixel_slopes(camera, flat, at, wanted)
     by_camera = by_camera - by_motion[..., :3] @ undo
     spread = by_camera @ half.T
@@ -106,8 +105,7 @@ def pixel_errors(camera: Camera, truth: Camera, places: Tensor, *, at: float = m
 
     def seen_apart(pixels: Tensor, at: float) -> Tensor:
         rays, valid = camera.unproject(pixels)
-        points = FAR * rays if math.isinf(at) else camera.ray_origins(rays) + at * rays
-        seen, visible = truth.project(points)
+        seen, visible = truth.project(FAR * rays if math.isinf(at) else camera.ray_origins(rays) + at * rays)
         return torch.where((valid & visible)[:, None], pixels - seen, torch.nan)
 
     everywhere = camera.grid(25, 17).reshape(-1, 2)
@@ -179,8 +177,7 @@ def pixel_slopes(camera: Camera, places: Tensor, at: float, wanted: list[int]) -
     rays = torch.where(valid[:, None], rays, rays.new_tensor([0.0, 0.0, 1.0]))
     points = FAR * rays if math.isinf(at) else camera.ray_origins(rays) + at * rays
     seen = project_components(points.T, camera.params.detach(), camera.model, wanted)
-    by_motion = step_rows(seen.by_point, points.T)
-    return seen.by_camera.permute(2, 1, 0), by_motion.permute(2, 1, 0), valid & seen.regular
+    return seen.by_camera.permute(2, 1, 0), step_rows(seen.by_point, points.T).permute(2, 1, 0), valid & seen.regular
 
 
 @torch.no_grad()
@@ -246,8 +243,7 @@ def carried_covariance(
     same = camera.model.fisheye == substitute.model.fisheye and all(names[index] in wanted for index in free)
     if same and not misfit:
         moved = half.new_zeros(len(half), len(wanted))
-        for index in free:
-            moved[:, wanted.index(names[index])] = half[:, index]
+        moved[:, [wanted.index(names[index]) for index in free]] = half[:, free]
         return moved.T @ moved
     rays, valid = camera.unproject(camera.grid(33, 25).reshape(-1, 2))
     own, _, seen = pixel_slopes(camera, rays, torch.inf, free)

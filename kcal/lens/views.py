@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcal.checks import StatedModule, as_points, keep_float64
+from kcal.checks import StatedModule, as_points
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
@@ -145,16 +145,9 @@ def _pinhole_parameters(low: Tensor, high: Tensor, size: tuple[int, int]) -> Ten
 
 def _points_on_sides(low: Tensor, high: Tensor, along: Tensor) -> Tensor:
     """Points (..., 4, N, 2) on the left, right, top and bottom side of a rectangle; `along` (..., 4, N) is 0 to 1."""
-    x, y = (low[..., i, None, None] + (high - low)[..., i, None, None] * along for i in (0, 1))
-    side = torch.tensor([0.0, 1.0], dtype=along.dtype, device=along.device)[:, None]
-    x_side, y_side = (low[..., i, None, None] + (high - low)[..., i, None, None] * side for i in (0, 1))
-    return torch.stack(
-        [
-            torch.cat([x_side.expand_as(x[..., :2, :]), x[..., 2:, :]], -2),
-            torch.cat([y[..., :2, :], y_side.expand_as(y[..., 2:, :])], -2),
-        ],
-        -1,
-    )
+    side = along.new_tensor([0.0, 1.0])[:, None].expand_as(along[..., :2, :])
+    across, down = torch.cat([side, along[..., 2:, :]], -2), torch.cat([along[..., :2, :], side], -2)
+    return low[..., None, None, :] + (high - low)[..., None, None, :] * torch.stack([across, down], -1)
 
 
 def _side_extremes(camera: Camera | TurnedCamera, outermost: bool) -> Tensor:
@@ -321,11 +314,7 @@ class Cylinder(StatedModule):
         """Size."""
         return self.size
 
-    def grid(self, columns: int, rows: int) -> Tensor:
-        """Pixels (rows, columns, 2) spread evenly over the picture, as `Camera.grid`."""
-        width, height = self.size
-        axes = [torch.linspace(0, last - 1, count) for last, count in ((width, columns), (height, rows))]
-        return torch.stack(torch.meshgrid(*axes, indexing="xy"), -1).to(self.params)
+    grid: Any = Camera.grid
 
     def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Map pixels (..., N, 2) to rays (..., N, 3) of length one, and valid (..., N): not behind the seam."""
@@ -348,9 +337,6 @@ class Cylinder(StatedModule):
         """Whether pixels (..., N, 2) lie in the picture, whose edges are half a pixel beyond the outer centers."""
         edge = torch.tensor(self.size, dtype=pixels.dtype, device=pixels.device) - 0.5
         return ((pixels >= -0.5) & (pixels <= edge)).all(-1)
-
-    def _apply(self, fn, recurse: bool = True):  # type: ignore[no-untyped-def]
-        return super()._apply(keep_float64(fn), recurse)
 
 
 def pinhole_view(field_of_view: float, size: tuple[int, int]) -> Camera:

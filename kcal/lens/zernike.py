@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kcal.dispatch import is_differentiated, is_traced, may_branch, may_overwrite
 from kcal.errors import InputError
-from kcal.lens.field_modes import WeightPrior
+from kcal.lens.field_modes import FieldModes, WeightPrior
 
 # Evaluate sums of Zernike modes by products of constant matrices, in few operations: for few places.
 #
@@ -117,8 +117,7 @@ class ZernikeProducts(NamedTuple):
         if scale is not None:
             pairs = pairs * scale
         # Rows at a time: these tables are large, and bound by memory.
-        found = torch.index_select(pairs, 0, self.pair, out=out)
-        return found.mul_(profiles.index_select(0, self.profile))
+        return torch.index_select(pairs, 0, self.pair, out=out).mul_(profiles.index_select(0, self.profile))
 
     def field(self, weights: Tensor, x: Tensor, y: Tensor, slopes: bool) -> tuple[Tensor, ...]:
         """As `FieldModes.field`."""
@@ -194,7 +193,7 @@ _Place = tuple[slice, slice] | None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ZernikeModes:
+class ZernikeModes(FieldModes):
     """Which modes a field has, by their highest degrees.
 
     Args:
@@ -239,10 +238,6 @@ class ZernikeModes:
         derived = _derived(self.radial, self.decentered, self.astigmatic, self.other)
         for name, value in zip(_DERIVED, derived, strict=True):
             object.__setattr__(self, name, value)
-
-    def __len__(self) -> int:
-        """Number of real weights."""
-        return len(self.real_modes)
 
     @property
     def radial_names(self) -> frozenset[str]:
@@ -410,10 +405,7 @@ def _times_plus(value: _Complex, z: _Complex, added: _Complex, reuse: bool) -> _
     (a, b), (x, y), (p, q) = value, z, added
     if reuse and p.shape == q.shape == x.shape and all(part.ndim == 0 or part.shape == x.shape for part in (a, b)):
         return p.addcmul_(a, x).addcmul_(b, y, value=-1.0), q.addcmul_(b, x).addcmul_(a, y)
-    return (
-        torch.addcmul(torch.addcmul(p, a, x), b, y, value=-1.0),
-        torch.addcmul(torch.addcmul(q, b, x), a, y),
-    )
+    return (torch.addcmul(torch.addcmul(p, a, x), b, y, value=-1.0), torch.addcmul(torch.addcmul(q, b, x), a, y))
 
 
 @functools.cache
