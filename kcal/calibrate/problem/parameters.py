@@ -278,7 +278,7 @@ class FreeParameters:
 
     def expand(self, step: Tensor) -> Tensor:
         """A step of the unknowns (..., len) as a step of each parameter."""
-        return step if self._plain else step[..., list(self.slots)]
+        return step if self.slots == tuple(range(len(self.slots))) else step[..., list(self.slots)]
 
     def by_parameter(self, covariance: Tensor, count: int) -> Tensor:
         """(count, count) of all parameters from that of the unknowns: tied ones alike, held ones zero."""
@@ -291,11 +291,6 @@ class FreeParameters:
         """For each unknown the names of the parameters that it is, among all `names`."""
         pairs = list(zip(self.indices, self.slots, strict=True))
         return [" = ".join(names[index] for index, own in pairs if own == slot) for slot in range(len(self))]
-
-    @property
-    def _plain(self) -> bool:
-        """Whether each parameter is an unknown, in their order."""
-        return self.slots == tuple(range(len(self.slots)))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

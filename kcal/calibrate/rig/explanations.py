@@ -187,10 +187,8 @@ def redundancy(problem: RigProblem) -> list[int | None]:
         added += block.added
     for term in problem.terms:
         added[list(term.about)] += term.count
-    unknown = [
-        0 if (turn, shift) == (None, None) else 3 * (turn is not None) + 3 * (shift is not None)
-        for turn, shift in zip(problem.turn, problem.shift, strict=True)
-    ]
+    slots = zip(problem.turn, problem.shift, strict=True)
+    unknown = [3 * (turn is not None) + 3 * (shift is not None) for turn, shift in slots]
     return [count - own if own else None for count, own in zip(added.tolist(), unknown, strict=True)]
 
 

@@ -127,24 +127,11 @@ def free(cameras: Sequence[Camera], names: Sequence[str]) -> SharedUnknowns:
             "hybrid cameras cannot be refined without what their own calibrations know: hold them, take what their "
             "calibrations know as prior, or calibrate parametric cameras"
         )
-    chosen = [free_parameters(camera.model) for camera in cameras]
-    count = sum(len(own) for own in chosen)
-    maps, labels, end = [], [], 0
-    for camera, own, name in zip(cameras, chosen, names, strict=True):
-        part = torch.zeros(len(camera.names), count, dtype=torch.float64)
-        for column, index in enumerate(own, start=end):
-            part[index, column] = 1.0
-            labels.append(f"{camera.names[index]} of {name}")
-        end += len(own)
-        maps.append(part)
-    return dataclasses.replace(
-        held(cameras),
-        cameras=tuple(maps),
-        board=torch.zeros(0, count, dtype=torch.float64),
-        begin=torch.zeros(count, dtype=torch.float64),
-        known=torch.zeros(count, dtype=torch.bool),
-        labels=tuple(labels),
-    )
+    chosen = [(camera, free_parameters(camera.model), name) for camera, name in zip(cameras, names, strict=True)]
+    labels = [f"{camera.names[index]} of {name}" for camera, own, name in chosen for index in own]
+    maps = torch.block_diag(*(torch.eye(len(camera.names), dtype=torch.float64)[:, own] for camera, own, _ in chosen))
+    found, _ = held(cameras)._and(*labels, known=False)
+    return dataclasses.replace(found, cameras=maps.split([len(camera.names) for camera in cameras]))
 
 
 # What the calibrations of a rig's cameras know, together: lenses, and the board that they saw, as one Gaussian.
