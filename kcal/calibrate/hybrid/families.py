@@ -190,9 +190,5 @@ def _numbers(indices: Sequence[int | None]) -> list[int]:
 
 def typical_hyperprior(modes: FieldModes | None = None) -> Hyperprior:
     """The prior for a camera and a board of which nothing is known; modes default to those of the default field."""
-    mean, sd, most = np.array((modes or ZernikeModes()).hyperprior).T
-    return Hyperprior(
-        torch.from_numpy(np.concatenate([mean, _MEAN])),
-        torch.from_numpy(np.concatenate([sd, _SD])),
-        torch.from_numpy(np.concatenate([most, np.full(len(_MEAN), np.inf)])),
-    )
+    own = np.stack([_MEAN, _SD, np.full(len(_MEAN), np.inf)], 1)
+    return Hyperprior(*torch.from_numpy(np.concatenate([(modes or ZernikeModes()).hyperprior, own]).T.copy()))

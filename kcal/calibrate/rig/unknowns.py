@@ -273,13 +273,11 @@ def joint_unknowns(
         corners = torch.einsum("bk,bcn->kcn", of_board, shapes).flatten(1)
         turns = _felt(cameras, given, _PX_PER_METER * corners, parts_known)
     # The unknowns of each camera, one after the other, and the board's: through these, lenses depend on each other.
-    columns, selected = torch.block_diag(*turns).split([len(known) for known in parts_known]), list[Tensor]()
-    for lens, own_columns in zip(given, columns, strict=False):
-        selected.append(lens.own @ own_columns + lens.by_board @ columns[-1])
+    *columns, last = torch.block_diag(*turns).split([len(known) for known in parts_known])
     found = SharedUnknowns(
-        cameras=tuple(selected),
+        cameras=tuple(lens.own @ own + lens.by_board @ last for lens, own in zip(given, columns, strict=True)),
         shapes=shapes,
-        board=of_board @ columns[-1],
+        board=of_board @ last,
         begin=torch.cat([turn.T @ begin for turn, begin in zip(turns, parts_begin, strict=True)]),
         known=torch.cat([(turn[known] != 0).any(0) for turn, known in zip(turns, parts_known, strict=True)]),
         labels=("",) * sum(turn.shape[1] for turn in turns),
