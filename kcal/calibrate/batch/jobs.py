@@ -220,11 +220,7 @@ def observations_of(
         len(views), [(paths[one.name], f"{one.name}: {one.reason}") for one in failures], len(pieces), job.board
     )
     seen = Observations(
-        board=job.board,
-        image_size=common.size,
-        refinement=refine,
-        views=tuple(views),
-        failures=tuple(failures),
+        board=job.board, image_size=common.size, refinement=refine, views=tuple(views), failures=tuple(failures)
     )
     return seen, "; ".join(common.notes)
 

@@ -18,11 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import (
-    check_directions,
-    roll_findings,
-    what_to_photograph,
-)
+from kcal.calibrate.camera.advice import check_directions, roll_findings, what_to_photograph
 from kcal.calibrate.camera.checks import (
     MINIMUM_VIEWS,
     check_views,

@@ -15,14 +15,7 @@ from torch import Tensor
 from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import STRETCH, BoardModes, board_modes
 from kcal.calibrate.hybrid.evidence import WORTH, Amplitudes, posterior_root
-from kcal.calibrate.hybrid.families import (
-    BEFORE_LENS,
-    BOARD,
-    PUPIL,
-    LensPrior,
-    PriorFamilies,
-    typical_hyperprior,
-)
+from kcal.calibrate.hybrid.families import BEFORE_LENS, BOARD, PUPIL, LensPrior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.fitted_views import (
     LAST,
     Estimate,

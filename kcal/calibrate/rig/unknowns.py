@@ -219,9 +219,7 @@ def less(known: CameraInformation, rows: Tensor) -> CameraInformation:
     kept = values > 1e-10 * values[-1:].sum()
     root = values[kept].sqrt()
     return dataclasses.replace(
-        known,
-        rows=root[:, None] * vectors[:, kept].T / scale,
-        residuals=vectors[:, kept].T @ gradient / root,
+        known, rows=root[:, None] * vectors[:, kept].T / scale, residuals=vectors[:, kept].T @ gradient / root
     )
 
 
