@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from kcal.errors import DegenerateError
-from kcal.solve.lm import LMOptions, S, State, minimize
+from kcal.solve.lm import LMOptions, Problem, S, State, minimize
 from kcal.solve.schur import SchurLinearization
 
 # A cost (scalar) of a shared step (S,), a local step (V, L) and data.
@@ -26,19 +26,6 @@ NO_MINIMUM = (
     "the solution has no derivatives, because it is no minimum that the data determine (a flat cost, a saddle, a "
     "barrier): fix parameters, choose a smaller model, add views or priors"
 )
-
-
-class BlockProblem(Protocol[S]):
-    """What is asked of a problem: see `kcal.solve.lm.Problem`; one element, with local blocks."""
-
-    @property
-    def residual_count(self) -> int: ...  # noqa: D102
-
-    def cost(self, state: S) -> Tensor: ...  # noqa: D102
-
-    def linearize(self, state: S) -> SchurLinearization: ...  # noqa: D102
-
-    def retract(self, state: S, step: State) -> S: ...  # noqa: D102
 
 
 class HessianSolve(NamedTuple):
@@ -102,18 +89,18 @@ class HessianSolve(NamedTuple):
         raise DegenerateError(NO_MINIMUM)
 
 
-def newton_minimum(problem: BlockProblem[S], state: S, effort: LMOptions) -> tuple[S, HessianSolve]:
+def newton_minimum(problem: Problem[S], state: S, effort: LMOptions) -> tuple[S, HessianSolve]:
     """The minimum next to a state to rounding, and systems with the Hessian there.
 
     Args:
-        problem: its cost in operations that autograd differentiates twice.
+        problem: of one element, with local blocks; its cost in operations that autograd differentiates twice.
         state: near a minimum.
         effort: of a solver that comes close to it.
 
     Raises:
         DegenerateError: there is no minimum that the data determine.
     """
-    state = minimize(cast(Any, problem), state, effort).state
+    state = minimize(problem, state, effort).state
     exact = 0.5 * problem.residual_count * _EXACT**2
     least = math.inf
     for _ in range(_NEWTON_STEPS):

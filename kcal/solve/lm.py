@@ -114,33 +114,23 @@ class SolverStatus(enum.IntEnum):
     improving, but many steps together by too little to matter: the data hardly determine some direction.
     """
 
-    RUNNING = 0
-    CONVERGED = 1
-    EXACT = 2
-    ITERATION_LIMIT = 3
-    STALLED = 4
-    BAD_START = 5
-    INTERRUPTED = 6
-    AT_BOUND = 7
-    FLAT = 8
+    RUNNING = 0, "still running"
+    CONVERGED = 1, "converged: no step lowers the cost by more than the tolerance"
+    EXACT = 2, "converged: the residual is zero to rounding"
+    ITERATION_LIMIT = 3, "stopped at the iteration limit while still improving"
+    STALLED = 4, "stalled: no step lowers the cost although one was predicted"
+    BAD_START = 5, "the cost at the start is not finite"
+    INTERRUPTED = 6, "interrupted; this is the best state so far"
+    AT_BOUND = 7, "stopped at a bound: lower costs lie beyond what is allowed"
+    FLAT = 8, "stopped where the cost is flat: the last steps lowered it by too little to matter"
 
-    @property
-    def message(self) -> str:
-        """The reason in words."""
-        return _MESSAGES[self]
+    message: str
 
-
-_MESSAGES = {
-    SolverStatus.RUNNING: "still running",
-    SolverStatus.CONVERGED: "converged: no step lowers the cost by more than the tolerance",
-    SolverStatus.EXACT: "converged: the residual is zero to rounding",
-    SolverStatus.ITERATION_LIMIT: "stopped at the iteration limit while still improving",
-    SolverStatus.STALLED: "stalled: no step lowers the cost although one was predicted",
-    SolverStatus.BAD_START: "the cost at the start is not finite",
-    SolverStatus.AT_BOUND: "stopped at a bound: lower costs lie beyond what is allowed",
-    SolverStatus.FLAT: "stopped where the cost is flat: the last steps lowered it by too little to matter",
-    SolverStatus.INTERRUPTED: "interrupted; this is the best state so far",
-}
+    def __new__(cls, value: int, message: str = "") -> Self:
+        """A number with its reason in words, `message`."""
+        made = int.__new__(cls, value)
+        made._value_, made.message = value, message
+        return made
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -194,11 +184,9 @@ class Linearization(Protocol):
     @property
     def cost(self) -> Tensor:
         """(...) half the sum of squared residuals."""
-        ...
 
     def blend(self, mask: Tensor, other: Self) -> Self:
         """The other linearization where the mask (...) of the batch is true, else this one."""
-        ...
 
     def step(self, damping: Tensor) -> tuple[State, Tensor]:
         """Solve (JᵀJ + λ D) δ = -Jᵀr with D = diag(JᵀJ).
@@ -207,7 +195,6 @@ class Linearization(Protocol):
             δ in the problem's form, and the decrease of the cost (...) that the linear model predicts. Where the
             system cannot be solved the decrease is not finite.
         """
-        ...
 
 
 Bend = Callable[[S, State, Any, Tensor], State | None]
@@ -223,36 +210,29 @@ class Problem(Protocol[S]):
     @property
     def batch(self) -> tuple[int, ...]:
         """Shape of the batch."""
-        ...
 
     @property
     def joint(self) -> bool:
         """Whether a linearization costs little more than the cost alone, so that trial states are linearized."""
-        ...
 
     @property
     def residual_count(self) -> int:
         """Number of scalar residuals of one element, for the rounding floor."""
-        ...
 
     def cost(self, state: S) -> Tensor:
         """Half the sum of squared residuals, (...)."""
-        ...
 
     def linearize(self, state: S) -> Any:
         """The problem's linearization at `state`."""
-        ...
 
     def retract(self, state: S, step: State) -> S:
         """Apply a step: plain addition, or a move on a manifold."""
-        ...
 
     def select(self, elements: Tensor) -> Problem[S] | None:
         """The problem of some elements (K,) of a batch with one dimension; None where that is not possible.
 
         The solver uses it to drop elements that have stopped.
         """
-        ...
 
 
 # Levenberg-Marquardt with trust-region damping, for problems and residual functions, and gradients through it.
@@ -466,14 +446,11 @@ def _minimize(
     linear = problem.linearize(state)
     device = linear.cost.device
 
-    def on_host(values: Tensor) -> np.ndarray:
-        return host_values(values)
-
     def on_device(values: np.ndarray) -> Tensor:
         return torch.from_numpy(np.asarray(values)).to(device)
 
     # Decisions need a handful of numbers per element; NumPy handles these several times faster than torch.
-    cost = on_host(linear.cost)
+    cost = host_values(linear.cost)
     damping, growth = np.full_like(cost, options.initial_damping), np.full_like(cost, 2.0)
     iterations = np.zeros(cost.shape, np.int64)
     status = np.where(np.isfinite(cost), int(SolverStatus.RUNNING), int(SolverStatus.BAD_START))
@@ -502,7 +479,7 @@ def _minimize(
                 running = running[kept]
                 linear = problem.linearize(state)
         step, decrease = linear.step(on_device(damping))
-        predicted = on_host(decrease)
+        predicted = host_values(decrease)
         solved = np.isfinite(predicted)
         # A tiny prediction means a minimum only where little damping shaped the step.
         flat = running & solved & (predicted <= options.tolerance * cost) & (damping <= _LITTLE_DAMPING)
@@ -513,10 +490,11 @@ def _minimize(
             break
         candidate = problem.retract(state, step)
         joint = problem.linearize(candidate) if problem.joint else None
-        new_cost = on_host(problem.cost(candidate) if joint is None else joint.cost)
+        new_cost = host_values(problem.cost(candidate) if joint is None else joint.cost)
         if bend is not None and solved and not new_cost < cost:
             bent = bend(state, step, linear, on_device(damping))
-            if bent is not None and (other_cost := on_host(problem.cost(other := problem.retract(state, bent)))) < cost:
+            other = candidate if bent is None else problem.retract(state, bent)
+            if bent is not None and (other_cost := host_values(problem.cost(other))) < cost:
                 candidate, new_cost = other, other_cost
         # An infinite fall over an infinite prediction is no gain, and not accepted.
         with np.errstate(invalid="ignore"):
@@ -542,7 +520,7 @@ def _minimize(
             # Where the residual stays large and curved, steps need damping even at the minimum and end in rounding.
             # The undamped step then tells whether this is a minimum.
             _, free = linear.step(on_device(np.full_like(damping, _LITTLE_DAMPING)))
-            at_minimum = stalled & (on_host(free) <= options.tolerance * cost)
+            at_minimum = stalled & (host_values(free) <= options.tolerance * cost)
             status = np.where(at_minimum, int(SolverStatus.CONVERGED), status)
             status = np.where(stalled & ~at_minimum, int(SolverStatus.STALLED), status)
         if options.flatness and trial >= _PATIENCE:
@@ -559,7 +537,7 @@ def _minimize(
                 left, damped = predicted, damping > _LITTLE_DAMPING
                 if (little & damped).any():
                     _, free = linear.step(on_device(np.full_like(damping, _LITTLE_DAMPING)))
-                    left = np.where(damped, on_host(free), predicted)
+                    left = np.where(damped, host_values(free), predicted)
                 slow = ~(left <= options.flatness * cost) | (long_since - cost <= options.flatness * cost)
                 status = np.where(little & slow, int(SolverStatus.FLAT), status)
         if callback is not None and callback(trial, on_device(history[-1])):

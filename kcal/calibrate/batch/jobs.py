@@ -174,8 +174,7 @@ def _read_table(path: Path) -> list[dict[str, str]]:
 
 def hash_of(*parts: object) -> str:
     """Name a piece of work by everything that it depends on."""
-    text = repr((kcal.__version__, *parts))
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
+    return hashlib.sha256(repr((kcal.__version__, *parts)).encode()).hexdigest()[:32]
 
 
 def detection_key(digest: str, board: Board, refine: str) -> str:
@@ -221,11 +220,7 @@ def observations_of(
         len(views), [(paths[one.name], f"{one.name}: {one.reason}") for one in failures], len(pieces), job.board
     )
     seen = Observations(
-        board=job.board,
-        image_size=common.size,
-        refinement=refine,
-        views=tuple(views),
-        failures=tuple(failures),
+        board=job.board, image_size=common.size, refinement=refine, views=tuple(views), failures=tuple(failures)
     )
     return seen, "; ".join(common.notes)
 

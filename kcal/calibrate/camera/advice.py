@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -300,8 +300,6 @@ def check_directions(
 # once its own pose is eliminated. The best one reduces the variance of points at infinity most, averaged over the image
 # (A-optimal design; for calibration: Peng and Sturm, "Calibration wizard", ICCV 2019).
 
-T = TypeVar("T")
-
 # Grid of the image over which variances are averaged.
 _GRID = (13, 9)
 # What a person can hold: shares of the image's shorter side that a board fills, degrees of tilt, quarter rolls.
@@ -375,7 +373,7 @@ def possible_views(camera: Camera, board: Board) -> BoardViews:
         rays, valid = camera.unproject(torch.tensor([[u, v] for (_, v), (_, u) in places], dtype=torch.float64))
         distance = extent * float(paraxial_focal(camera).value.min()) / (fill * side)
         size = "near" if fill == _FILLS[-1] else "far"
-        for ((up, _), (across, _)), ray in zip(_kept(places, valid), rays[valid], strict=True):
+        for ((up, _), (across, _)), ray in zip(itertools.compress(places, valid), rays[valid], strict=True):
             place = " ".join(filter(None, (up, across))) or "middle"
             for roll, (tilt, leaning) in itertools.product(_ROLLS, _TILTS.items()):
                 turn = _facing(ray) @ _rotation(*tilt, 0.0) @ _rotation(0.0, 0.0, roll)
@@ -387,7 +385,7 @@ def possible_views(camera: Camera, board: Board) -> BoardViews:
     pixels, valid = camera.project(points @ rotation.mT + translation[:, None])
     inside = ((pixels >= 0) & (pixels <= torch.tensor([width - 1, height - 1], dtype=pixels.dtype))).all(-1)
     good = (inside & valid).all(-1)
-    return BoardViews(rotation[good], translation[good], pixels[good], tuple(_kept(words, good)))
+    return BoardViews(rotation[good], translation[good], pixels[good], tuple(itertools.compress(words, good)))
 
 
 def far_sigma(camera: Camera) -> float:
@@ -448,10 +446,6 @@ def _half_after(
             lower = torch.linalg.cholesky(torch.eye(rows.shape[1], dtype=rows.dtype) + rows.T @ rows)
             half = torch.linalg.solve_triangular(lower, half, upper=False)
     return half
-
-
-def _kept(items: Sequence[T], good: Tensor) -> list[T]:
-    return [item for item, fits in zip(items, good.tolist(), strict=True) if fits]
 
 
 def _view_rows(

@@ -393,7 +393,7 @@ def camera_at_setting(
     spread = setting_sigmas(axes, setting, setting_sigma or {})
     same = (places == at).all(1).nonzero()[:, 0]
     if len(same) == 1 and not bool(spread.any()):
-        return _calibrated(cameras, int(same[0]))
+        return _calibrated(cameras, int(same[0]), known[int(same[0])])
     spline = spline_between(axes, places, at, names)
     weights = spline.weights(at)
     pixels = cameras[0].grid(*_GRID).reshape(-1, 2)
@@ -460,15 +460,12 @@ def _far_sigma(camera: Camera, half: Tensor) -> float:
     return float(torch.linalg.eigvalsh(found)[:, -1].clamp_min(0.0).sqrt().median())
 
 
-def _calibrated(cameras: Sequence[Camera], number: int) -> InterpolatedCamera:
+def _calibrated(cameras: Sequence[Camera], number: int, known: CameraInformation) -> InterpolatedCamera:
     """A setting that was calibrated."""
-    camera = cameras[number]
-    known = camera.calibration.known(camera.params.detach()) if camera.calibration else None
-    assert known is not None
     return InterpolatedCamera(
-        camera=camera,
+        camera=cameras[number],
         weights=tuple(float(i == number) for i in range(len(cameras))),
-        calibration_px=_far_sigma(camera, known.by_parameter(known.half())),
+        calibration_px=_far_sigma(cameras[number], known.by_parameter(known.half())),
         interpolation_px=0.0,
         setting_px=0.0,
         misfit_px=0.0,

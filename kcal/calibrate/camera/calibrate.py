@@ -19,13 +19,7 @@ from kcal.calibrate.camera.hybrid import (
     without_views,
 )
 from kcal.calibrate.camera.one_camera import lenses_by_view
-from kcal.calibrate.camera.result import (
-    COPY,
-    CalibrationOptions,
-    CameraCalibrationResult,
-    Progress,
-    SharedBoard,
-)
+from kcal.calibrate.camera.result import COPY, CalibrationOptions, CameraCalibrationResult, Progress, SharedBoard
 from kcal.calibrate.camera.solve import calibrate_parametric
 from kcal.calibrate.camera.warnings import spacing_findings, unit_findings
 from kcal.calibrate.hybrid.base_fit import may_be_unequal

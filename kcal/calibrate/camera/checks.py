@@ -10,12 +10,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.result import (
-    CameraCalibrationResult,
-    OutlierRejection,
-    Progress,
-    Rejected,
-)
+from kcal.calibrate.camera.result import CameraCalibrationResult, OutlierRejection, Progress, Rejected
 from kcal.calibrate.problem.views import LEAST_NOISE, homographies, spread_out
 from kcal.corners.observations import Observations
 from kcal.errors import DegenerateError, InputError

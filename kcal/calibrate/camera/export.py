@@ -203,11 +203,7 @@ def _written() -> list[str]:
 
 
 def export_cameras(
-    cameras: Camera | Rig | Sequence[Camera],
-    path: str | Path,
-    *,
-    format: str | None = None,
-    model: str | None = None,
+    cameras: Camera | Rig | Sequence[Camera], path: str | Path, *, format: str | None = None, model: str | None = None
 ) -> ExportedCameras:
     """Write one camera, several, or a rig for another program.
 
@@ -436,11 +432,7 @@ def _lost(cameras: Sequence[Camera], rig: Rig | None, known: CameraFormat, carri
 
 
 def _write_splines(
-    cameras: Sequence[Camera],
-    exact: Sequence[Camera | None],
-    poses: Sequence[Pose],
-    path: Path,
-    lost: tuple[str, ...],
+    cameras: Sequence[Camera], exact: Sequence[Camera | None], poses: Sequence[Pose], path: Path, lost: tuple[str, ...]
 ) -> ExportedCameras:
     """Write mrcal files, those cameras as splines that its parametric models do not contain."""
     paths = paths_for(path, len(cameras))

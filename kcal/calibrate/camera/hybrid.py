@@ -18,11 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcal.calibrate.camera.advice import (
-    check_directions,
-    roll_findings,
-    what_to_photograph,
-)
+from kcal.calibrate.camera.advice import check_directions, roll_findings, what_to_photograph
 from kcal.calibrate.camera.checks import (
     MINIMUM_VIEWS,
     check_views,
@@ -244,7 +240,13 @@ def calibrate_what_fits(
             raise
         raise DegenerateError(f"{error}; the views are {_few_names(observations.names)}") from error
     if given is not None:
-        return _without_start(observations, options, given, failure, progress)
+        progress("again without the focal length that was given")
+        less = dataclasses.replace(options, focal=None, field_of_view=None)
+        try:
+            result = calibrate_what_fits(observations, less, progress)
+        except InputError:
+            raise failure from None
+        return _without_given(result, given, "belongs to no lens that shows the corners")
     wrong = _wrong_views(observations, options)
     listed = listed_views(observations, wrong)
     if not wrong or not few_views(len(wrong), len(observations.views)):
@@ -297,20 +299,6 @@ def _without_given(result: CameraCalibrationResult, given: float, why: str) -> C
     text = f"the focal length that was given for the start ({given:.4g} px) {why}: it was not used"
     note = Finding("start", "doubt", text, "leave it out, or correct it")
     return dataclasses.replace(result, findings=(note, *result.findings))
-
-
-def _without_start(
-    observations: Observations, options: CalibrationOptions, given: float, failure: Exception, progress: Progress
-) -> CameraCalibrationResult:
-    """Again, as if no focal length had been given."""
-    progress("again without the focal length that was given")
-    try:
-        result = calibrate_what_fits(
-            observations, dataclasses.replace(options, focal=None, field_of_view=None), progress
-        )
-    except InputError:
-        raise failure from None
-    return _without_given(result, given, "belongs to no lens that shows the corners")
 
 
 def _wrong_views(observations: Observations, options: CalibrationOptions) -> dict[int, str]:

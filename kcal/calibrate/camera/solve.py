@@ -203,9 +203,8 @@ class Solution:
 
     Args:
         views: the corners, all counting alike, and what is known about the camera.
-        problem: the final problem, with weights, loss, priors and barriers.
+        problem: the final problem, with weights and loss; priors and barriers are those of corners that count alike.
         result: its result.
-        terms: priors and barriers of the solution with all corners counting alike.
         rivals: costs and states of other solutions, all corners counting alike. Where one fits almost as well but lies
             far away, the corners alone do not determine the model.
         plain_cost: of this solution, likewise.
@@ -216,7 +215,6 @@ class Solution:
     views: CameraViews
     problem: BoardProblem
     result: Result[BoardState]
-    terms: tuple[Term, ...]
     rivals: tuple[tuple[float, BoardState], ...]
     plain_cost: float
     spent: int
@@ -232,7 +230,8 @@ class Solution:
         """The problem of any corners of this camera, with their weights and by default with this solution's terms."""
         weights = None if covariances is None or self.variance is None else whitening(covariances, self.variance)
         views = dataclasses.replace(self.views, pixels=pixels, whitening=weights, loss=loss)
-        return views.problem(self.problem.model, self.problem.free, terms=self.terms if terms is None else terms)
+        terms = self.problem.terms if terms is None else terms
+        return views.problem(self.problem.model, self.problem.free, terms=terms)
 
 
 def solve(observations: Observations, options: CalibrationOptions, progress: Progress) -> Solution:
@@ -305,7 +304,6 @@ def solve_corners(
         views=views,
         problem=problem,
         result=result,
-        terms=problem.terms,
         rivals=tuple((float(plain.cost(state)), state) for state in others if free),
         plain_cost=float(result.cost),
         spent=spent,
@@ -453,7 +451,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
             *general_findings(observations.names, camera, rms, per_view, lost, status),
             *doubts,
             *rival_findings(camera, sigma, solution.rivals, solution.plain_cost, problem.residual_count),
-            *prior_findings(solution.terms, solved.state, solution.views.prior_noise),
+            *prior_findings(problem.terms, solved.state, solution.views.prior_noise),
             *outlier_findings(
                 observations.names, weighted, stray_corners(weighted), "; this lens may need a richer model"
             ),
@@ -469,7 +467,7 @@ def _uncertainty(
         # Under a known camera and a flat board nothing is shared by the views.
         return Covariance(state.parameters.new_zeros(0, 0), state.parameters.new_zeros(0)), None
     # Barriers before folds are no information about the lens.
-    known = [term for term in solution.terms if isinstance(term, GaussianPrior)]
+    known = [term for term in solution.problem.terms if isinstance(term, GaussianPrior)]
     plain = solution.problem_for(observations.pixels(), observations.covariances(), loss, known)
     linear = plain.linearize(state)
     count, residuals = plain.shared_size + 6 * len(state.translation), plain.residual_count + plain.prior_count
@@ -485,7 +483,7 @@ def _led_by_prior(
 ) -> tuple[str, ...]:
     """Parameters whose variance would more than double without their prior."""
     led = []
-    for term in solution.terms:
+    for term in solution.problem.terms:
         if isinstance(term, GaussianPrior):
             spread = solution.views.prior_noise / term.weight
             for index, sigma in zip(term.index.tolist(), spread.tolist(), strict=True):

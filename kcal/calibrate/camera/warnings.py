@@ -122,14 +122,10 @@ def spacing_findings(result: CameraCalibrationResult, refused: bool = False) -> 
     allows = "the camera allows for this, and all distances are as right as that of the rows"
     if refused:
         allows = "only the default lens with a printed board allows for this"
-    unsure = (
-        ""
-        if not roll_findings(result.cam_from_board_rotation)
-        else (
-            "; or else pixels are not square, which views that show the board upright hardly tell: turn it by 90° "
-            "for a third of the views"
-        )
-    )
+    unsure = ""
+    if roll_findings(result.cam_from_board_rotation):
+        unsure = "; or else pixels are not square, which views that show the board upright hardly tell: turn it by 90° "
+        unsure += "for a third of the views"
     text = f"{apart} ({100 * value:+.2f} ± {100 * sigma:.2g} %), but one length was given for both: {allows}"
     action = (
         "measure both with a ruler, give the distance of the rows as --square, and print at 100 %, not fitted to the "

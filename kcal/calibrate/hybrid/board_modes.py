@@ -87,25 +87,15 @@ def board_modes(points: Tensor) -> BoardModes:
 
     left, right = legendre(a), legendre(b)
     zero = torch.zeros_like(a)
-    shapes: list[Tensor] = []
-    unit: list[float] = []
-    family: list[int] = []
-    for degree in (2, 3, 4):
-        for i in range(degree + 1):
-            shapes.append(torch.stack([zero, zero, left[i] * right[degree - i]]))
-            unit.append(0.5 ** (degree - 2))
-            family.append(BENDING)
-    for plane in (a, b):
-        shapes.append(torch.stack([plane, zero, zero]))
-        unit.append(1.0)
-        family.append(STRETCH)
-    for degree in (2, 3):
-        for i in range(degree + 1):
-            product = left[i] * right[degree - i]
-            shapes += [torch.stack([product, zero, zero]), torch.stack([zero, product, zero])]
-            unit += [0.5 ** (degree - 1)] * 2
-            family += [TRAPEZOID if i == 1 == degree - i else PRINT] * 2
-    return BoardModes(torch.stack(shapes), extent * torch.tensor(unit, dtype=points.dtype), torch.tensor(family))
+    products = [(degree, i, left[i] * right[degree - i]) for degree in (2, 3, 4) for i in range(degree + 1)]
+    modes = [((zero, zero, product), 0.5 ** (degree - 2), BENDING) for degree, _, product in products]
+    modes += [((plane, zero, zero), 1.0, STRETCH) for plane in (a, b)]
+    for degree, i, product in products[: 3 + 4]:
+        family, unit = TRAPEZOID if i == 1 == degree - i else PRINT, 0.5 ** (degree - 1)
+        modes += [((product, zero, zero), unit, family), ((zero, product, zero), unit, family)]
+    shapes, units, families = zip(*modes, strict=True)
+    units_of = extent * torch.tensor(units, dtype=points.dtype)
+    return BoardModes(torch.stack([torch.stack(shape) for shape in shapes]), units_of, torch.tensor(families))
 
 
 def undetermined_modes(points: Tensor) -> Tensor:

@@ -13,14 +13,7 @@ from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import CLEAR, find_turns, turned, turned_corner_offsets, turned_corners
 from kcal.calibrate.hybrid.evidence import Quadratic, negative_log_evidence
-from kcal.calibrate.hybrid.families import (
-    BEFORE_LENS,
-    BOARD,
-    Hyperprior,
-    LensPrior,
-    PriorFamilies,
-    typical_hyperprior,
-)
+from kcal.calibrate.hybrid.families import BEFORE_LENS, BOARD, Hyperprior, LensPrior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.measured_board import BoardPrior, MeasuredBoard, evidence, printed_board, printed_prior
 from kcal.corners.board import Board

@@ -84,10 +84,8 @@ class PriorFamilies(NamedTuple):
             modes: amplitudes of the board that these priors are of.
             hyper: number of the hyperparameters.
         """
-        family, zero = (
-            torch.where(board.family == KNOWN, -1, hyper + BOARD + board.family),
-            torch.zeros_like(board.unit),
-        )
+        family = torch.where(board.family == KNOWN, -1, hyper + BOARD + board.family)
+        zero = torch.zeros_like(board.unit)
         own = (zero, board.unit.log(), family, torch.full_like(family, -1), zero)
         return PriorFamilies(
             *(torch.cat([part[: len(part) - modes], new]) for part, new in zip(self, own, strict=True))
@@ -167,33 +165,22 @@ def prior_families(
     corner = math.atan(0.5 * diagonal / focal)
     leading = [_FOCAL * focal, _CENTER * diagonal, _CENTER * diagonal, 1.0 + 0.5 / corner**2, distance, distance]
     rows = [] if aspect is None else [_FOCAL * aspect * focal]
-    mean = torch.zeros(len(leading) + len(form.modes) + len(rows) + len(board.unit), dtype=torch.float64)
+    mean = torch.zeros(len(leading) + len(form.modes) + len(rows), dtype=torch.float64)
     mean[:4] = torch.tensor([focal, (size[0] - 1) / 2, (size[1] - 1) / 2, 0.5 - form.shape])
     if aspect is not None:
-        mean[-1 - len(board.unit)] = aspect * focal
+        mean[-1] = aspect * focal
     amplitude, decay, degree = zip(*form.modes.weight_priors, strict=True)
     by_pupil = len(form.modes.hyperprior)
     # Without an amplitude: how surely pixels are square.
     field_unit = [math.log(form.radius) + (math.log(SQUARE) if own is None else 0.0) for own in amplitude]
     none, more = [-1] * len(leading), [-1] * len(rows)
-    board_family = torch.where(board.family == KNOWN, -1, by_pupil + 1 + board.family)
     families = PriorFamilies(
         mean,
-        torch.cat(
-            [
-                torch.tensor([*map(math.log, leading), *field_unit, *map(math.log, rows)], dtype=torch.float64),
-                board.unit.log(),
-            ]
-        ),
-        torch.cat([torch.tensor([*none[:-2], by_pupil, by_pupil, *_numbers(amplitude), *more]), board_family]),
-        torch.cat([torch.tensor([*none, *_numbers(decay), *more]), torch.full_like(board.family, -1)]),
-        torch.cat(
-            [
-                torch.tensor([0.0] * len(leading) + [*degree] + [0.0] * len(rows), dtype=torch.float64),
-                torch.zeros_like(board.unit),
-            ]
-        ),
-    )
+        mean.new_tensor([*map(math.log, leading), *field_unit, *map(math.log, rows)]),
+        torch.tensor([*none[:-2], by_pupil, by_pupil, *_numbers(amplitude), *more]),
+        torch.tensor([*none, *_numbers(decay), *more]),
+        torch.nn.functional.pad(mean.new_tensor(degree), (len(leading), len(rows))),
+    ).with_board(board, 0, by_pupil + len(_MEAN))
     return families.with_port() if form.port else families
 
 
@@ -203,9 +190,5 @@ def _numbers(indices: Sequence[int | None]) -> list[int]:
 
 def typical_hyperprior(modes: FieldModes | None = None) -> Hyperprior:
     """The prior for a camera and a board of which nothing is known; modes default to those of the default field."""
-    mean, sd, most = np.array((modes or ZernikeModes()).hyperprior).T
-    return Hyperprior(
-        torch.from_numpy(np.concatenate([mean, _MEAN])),
-        torch.from_numpy(np.concatenate([sd, _SD])),
-        torch.from_numpy(np.concatenate([most, np.full(len(_MEAN), np.inf)])),
-    )
+    own = np.stack([_MEAN, _SD, np.full(len(_MEAN), np.inf)], 1)
+    return Hyperprior(*torch.from_numpy(np.concatenate([(modes or ZernikeModes()).hyperprior, own]).T.copy()))

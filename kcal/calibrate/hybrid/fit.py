@@ -15,14 +15,7 @@ from torch import Tensor
 from kcal.calibrate.hybrid.base_fit import fit_base
 from kcal.calibrate.hybrid.board_modes import STRETCH, BoardModes, board_modes
 from kcal.calibrate.hybrid.evidence import WORTH, Amplitudes, posterior_root
-from kcal.calibrate.hybrid.families import (
-    BEFORE_LENS,
-    BOARD,
-    PUPIL,
-    LensPrior,
-    PriorFamilies,
-    typical_hyperprior,
-)
+from kcal.calibrate.hybrid.families import BEFORE_LENS, BOARD, PUPIL, LensPrior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.fitted_views import (
     LAST,
     Estimate,
@@ -498,22 +491,17 @@ class HybridFit:
 
     def only(self, views: Sequence[int]) -> HybridFit:
         """This fit with some of its views, where the others had no weight in it."""
-        at, state = list(views), self.state
-        state = state._replace(rotation=state.rotation[at], translation=state.translation[at], motion=state.motion[at])
-        relative = None if self.relative is None else self.relative[at]
-        return dataclasses.replace(
-            self, state=state, relative=relative, residuals=self.residuals[at], weights=self.weights[at]
-        )
+        return self._with_views(lambda values: values[list(views)])
 
     def among(self, views: Sequence[int], count: int) -> HybridFit:
         """This fit with entries for `count` views: NaN for those that it did not use."""
-        own = self.state
-        rotation, translation, motion, residuals, weights = (
-            among(values, views, count)
-            for values in (own.rotation, own.translation, own.motion, self.residuals, self.weights)
-        )
+        return self._with_views(lambda values: among(values, views, count))
+
+    def _with_views(self, change: Callable[[Tensor], Tensor]) -> HybridFit:
+        own, relative = self.state, None if self.relative is None else change(self.relative)
+        rotation, translation, motion = map(change, (own.rotation, own.translation, own.motion))
         state = own._replace(rotation=rotation, translation=translation, motion=motion)
-        relative = None if self.relative is None else among(self.relative, views, count)
+        residuals, weights = change(self.residuals), change(self.weights)
         return dataclasses.replace(self, state=state, relative=relative, residuals=residuals, weights=weights)
 
     @property

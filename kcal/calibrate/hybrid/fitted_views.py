@@ -589,13 +589,9 @@ def columns_may_be_read(rounds: Rounds) -> bool:
     if not rounds.converged or max(found.turn, found.shift) > _TOO_MUCH:
         return True
     still = estimate._replace(state=estimate.state._replace(motion=torch.zeros_like(estimate.state.motion)))
-    by_rows, by_columns = (
-        capture.data(capture.problem(estimate), still)
-        for capture in (
-            dataclasses.replace(rounds.capture, readout=dataclasses.replace(readout, columns=columns))
-            for columns in (False, True)
-        )
-    )
+    readouts = [dataclasses.replace(readout, columns=columns) for columns in (False, True)]
+    captures = [dataclasses.replace(rounds.capture, readout=one) for one in readouts]
+    by_rows, by_columns = (capture.data(capture.problem(estimate), still) for capture in captures)
     prior, families, amplitudes = rounds.capture.hyperprior, estimate.families, estimate.amplitudes
     # Amplitudes are the best ones for rows already.
     best = maximize_evidence(by_columns, families, amplitudes, prior, rough=True)
@@ -652,13 +648,7 @@ def moving_residuals(
         return out
     params = camera.params.detach()
     some = pixels[posed]
-    problem = BoardProblem(
-        board_points,
-        some,
-        camera.model,
-        readout=readout,
-        stillness=stillness,
-    )
+    problem = BoardProblem(board_points, some, camera.model, readout=readout, stillness=stillness)
     motion = rotation.new_zeros(len(some), readout.numbers)
     state = BoardState.flat(params, rotation[posed], translation[posed])._replace(motion=motion)
     out[posed] = problem.corner_residuals(minimize(problem, state, _EFFORT).state)

@@ -84,11 +84,7 @@ class _Turn:
         return float(problem.cost(estimate.state) + estimate.variance * self.pull(weights_of(_trunk(estimate))))
 
 
-def train_network(
-    rounds: Rounds,
-    options: FieldTraining,
-    progress: Callable[[str], object] = lambda _: None,
-) -> Rounds:
+def train_network(rounds: Rounds, options: FieldTraining, progress: Callable[[str], object] = lambda _: None) -> Rounds:
     """Train the network of a fit's field, beginning where the fit converged.
 
     Args:

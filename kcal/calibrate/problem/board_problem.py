@@ -204,10 +204,10 @@ class BoardProblem(SchurProblem[BoardState]):
         return (values[None] if self._numbers is None else values[..., self._numbers].movedim(-2, 0)).contiguous()
 
     def _of_all(self, values: Tensor, fill: float | bool) -> Tensor:
-        """(..., V, C, N) of values (..., V, C, K)."""
+        """(V, ..., N) of values (V, ..., K)."""
         if self._numbers is None:
             return values
-        numbers = self._numbers[:, None].expand_as(values)
+        numbers = self._numbers.view(len(values), *[1] * (values.ndim - 2), -1).expand_as(values)
         return values.new_full((*values.shape[:-1], self.board_points.shape[-2]), fill).scatter(-1, numbers, values)
 
     @property
@@ -326,26 +326,19 @@ class BoardProblem(SchurProblem[BoardState]):
             vectors = torch.where(self._counts[..., views, None, None, :], vectors, 0.0)
         return self._weighted(vectors, views)
 
-    def corner_rows(self, state: BoardState, views: slice = ALL, memory: list[Tensor] | None = None) -> Tensor:
+    def corner_rows(self, state: BoardState, views: slice = ALL) -> Tensor:
         """(..., V, L + S + 1, 2 K) as `rows`, of the corners alone, and as if no unknown were held.
 
         With `memory` given, an empty list at first, the next call may overwrite what this one returns: new memory costs
         as much time as what is written there.
         """
-        rows, slopes = self._own_rows(state, views, memory)
+        rows, slopes = self._own_rows(state, views)
         if not self.displaced:
             return rows.flatten(-2)
         # Each residual depends on the displacement of its own corner alone.
         each = torch.einsum("vaun,nm->vamun", slopes, torch.eye(slopes.shape[-1], dtype=slopes.dtype))
-        each = self._by_number(each.movedim(2, -1)).movedim(-1, 2).flatten(1, 2)
+        each = self._of_all(each.movedim(2, -1), 0.0).movedim(-1, 2).flatten(1, 2)
         return torch.cat([rows[:, :-1], each, rows[:, -1:]], 1).flatten(-2)
-
-    def _by_number(self, values: Tensor) -> Tensor:
-        """(V, ..., N) of values (V, ..., K); 0 for corners that no work is done on."""
-        if self._numbers is None:
-            return values
-        numbers = self._numbers.view(len(values), *[1] * (values.ndim - 2), -1).expand_as(values)
-        return values.new_zeros(*values.shape[:-1], self.board_points.shape[-2]).scatter(-1, numbers, values)
 
     def _own_rows(self, state: BoardState, views: slice, memory: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Rows (..., V, L + S + 1, 2, K) without displacements of the corners; derivatives (V, 2, 2, K) by these."""
@@ -556,8 +549,8 @@ class BoardProblem(SchurProblem[BoardState]):
         if self.displaced:
             # Corners meet lens, poses and residuals only in their own rows: these products cost little.
             along = rows[:, :, None, 0] * slopes[:, None, :, 0]
-            with_rows = self._by_number(along.addcmul_(rows[:, :, None, 1], slopes[:, None, :, 1])).flatten(2)
-            own = self._by_number(torch.einsum("vaun,vbun->vabn", slopes, slopes)).sum(0)
+            with_rows = self._of_all(along.addcmul_(rows[:, :, None, 1], slopes[:, None, :, 1]), 0.0).flatten(2)
+            own = self._of_all(torch.einsum("vaun,vbun->vabn", slopes, slopes), 0.0).sum(0)
             own = torch.einsum("abn,nm->anbm", own, torch.eye(own.shape[-1], dtype=own.dtype)).flatten(2).flatten(0, 1)
             beside = with_rows[:, L:].sum(0)
             right = torch.cat([right[..., :-1], with_rows[:, :L], right[..., -1:]], -1)
@@ -662,7 +655,7 @@ class BoardProblem(SchurProblem[BoardState]):
         if not self.displaced:
             return found
         each = (slopes * corners.unflatten(-1, (2, -1))[:, None]).sum(2)
-        return torch.cat([found, self._by_number(each).flatten(1)], 1)
+        return torch.cat([found, self._of_all(each, 0.0).flatten(1)], 1)
 
     def tidy(self, state: BoardState) -> BoardState:
         """The state with its rotations made orthonormal again after many small steps."""

@@ -225,15 +225,14 @@ class CoefficientPrior:
             [1.2, 4.8, 0.02, 0.02]
         """
         r, names = min(self.reach, _FARTHEST), parameter_names(model)
-        shift: dict[int, float] = {}
+        # Tangential and tilt terms grow with the square of the radius.
+        shift = dict.fromkeys(range(model.size), r / _ASSEMBLY)
         for orders in (model.numerator_index, model.denominator_index):
             shift |= {i: r ** (2 * j + 2) for j, i in enumerate(orders)}
         for orders in model.prism_index if model.prism else ():
             shift |= {i: r ** (2 * j + 1) / _ASSEMBLY for j, i in enumerate(orders)}
-        # Tangential and tilt terms grow with the square of the radius.
-        shift |= {i: r / _ASSEMBLY for i in range(model.size) if i not in shift}
         offset = len(INTRINSICS)
-        index = [offset + i for i in sorted(shift) if names[offset + i] not in without]
+        index = [offset + i for i in shift if names[offset + i] not in without]
         weight = torch.tensor([noise * shift[i - offset] / self.width for i in index], dtype=torch.float64)
         return GaussianPrior(torch.tensor(index, dtype=torch.long), torch.zeros_like(weight), weight)
 
@@ -278,7 +277,7 @@ class FreeParameters:
 
     def expand(self, step: Tensor) -> Tensor:
         """A step of the unknowns (..., len) as a step of each parameter."""
-        return step if self._plain else step[..., list(self.slots)]
+        return step if self.slots == tuple(range(len(self.slots))) else step[..., list(self.slots)]
 
     def by_parameter(self, covariance: Tensor, count: int) -> Tensor:
         """(count, count) of all parameters from that of the unknowns: tied ones alike, held ones zero."""
@@ -291,11 +290,6 @@ class FreeParameters:
         """For each unknown the names of the parameters that it is, among all `names`."""
         pairs = list(zip(self.indices, self.slots, strict=True))
         return [" = ".join(names[index] for index, own in pairs if own == slot) for slot in range(len(self))]
-
-    @property
-    def _plain(self) -> bool:
-        """Whether each parameter is an unknown, in their order."""
-        return self.slots == tuple(range(len(self.slots)))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -438,8 +438,7 @@ def _other_places(work: Adjustment, mask: Tensor) -> Iterator[RigState]:
         for rotation, center in own:
             turn = rotation.T @ state.rotation[c]
             yield state._replace(
-                rotation=state.rotation @ turn.T,
-                center=(state.center - state.center[c]) @ turn.T + center,
+                rotation=state.rotation @ turn.T, center=(state.center - state.center[c]) @ turn.T + center
             )
 
 

@@ -187,10 +187,8 @@ def redundancy(problem: RigProblem) -> list[int | None]:
         added += block.added
     for term in problem.terms:
         added[list(term.about)] += term.count
-    unknown = [
-        0 if (turn, shift) == (None, None) else 3 * (turn is not None) + 3 * (shift is not None)
-        for turn, shift in zip(problem.turn, problem.shift, strict=True)
-    ]
+    slots = zip(problem.turn, problem.shift, strict=True)
+    unknown = [3 * (turn is not None) + 3 * (shift is not None) for turn, shift in slots]
     return [count - own if own else None for count, own in zip(added.tolist(), unknown, strict=True)]
 
 
@@ -405,9 +403,7 @@ def _explanations(work: Adjustment, mask: Tensor, kept: Tensor, robust: RigState
             some = kept.clone()
             some[at] = mask[at]
             some[[i for landmark, i in chosen if landmark]] = False
-            if least_redundancy(trial.problem(some)) <= 0:
-                continue
-            if not _solved(trial, some):
+            if least_redundancy(trial.problem(some)) <= 0 or not _solved(trial, some):
                 continue
             names = tuple(work.labels[i] if landmark else labels[i] for landmark, i in chosen)
             found.append(_Explanation.of(trial, some, names, size))
@@ -419,9 +415,7 @@ def _explanations(work: Adjustment, mask: Tensor, kept: Tensor, robust: RigState
 
 def _solved(trial: Adjustment, mask: Tensor) -> bool:
     """Whether χ² is small enough at the solution from here, or from where landmarks alone put the cameras."""
-    for state in (trial.state, _resected(trial, mask)):
-        if state is None:
-            continue
+    for state in filter(None, (trial.state, _resected(trial, mask))):
         trial.state = state
         problem, _ = trial.solve(mask, TRIAL)
         fit = goodness_of_fit(problem, trial.part(mask))

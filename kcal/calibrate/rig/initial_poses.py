@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcal.calibrate.problem.views import among
 from kcal.calibrate.rig.pairs import check_cameras, half_turn, pose_alone, refuse_wrong_pairs
 from kcal.calibrate.rig.resection import consensus_rotation, distinct_poses
 from kcal.calibrate.rig.source import Start, as_items
@@ -213,13 +214,9 @@ class InitialPoses:
             return
         points, self._good = boards.points, boards.seen_well(data.cameras)
         for c, (camera, enough) in enumerate(zip(data.cameras, self._good.T, strict=True)):
-            rotation = torch.full((len(enough), 3, 3), math.nan, dtype=torch.float64)
-            translation = torch.full((len(enough), 3), math.nan, dtype=torch.float64)
-            rms = torch.full((len(enough),), math.nan, dtype=torch.float64)
-            if bool(enough.any()):
-                found, rms[enough] = pose_alone(points, boards.pixels[enough, c], camera, solver)
-                rotation[enough], translation[enough] = found.rotation, found.translation
-            alone.append((Pose(rotation, translation), rms))
+            poses, rms = pose_alone(points, boards.pixels[enough, c], camera, solver)
+            views, count = enough.nonzero()[:, 0].tolist(), len(enough)
+            alone.append((Pose(*(among(part, views, count) for part in poses)), among(rms, views, count)))
         check_cameras(data, self._good, alone, solver)
         self._alone = [poses for poses, _ in alone]
 

@@ -505,7 +505,7 @@ class SkylineSource(Measurement):
             raise InputError(f"skyline: cameras 0 to {count - 1} are there")
         require_finite("skyline: rows", self.rows)
         require_finite("skyline: residual", self.residual)
-        require_finite("skyline: rotation", self.rotation[sorted(set(self.cameras))])
+        require_finite("skyline: rotation", self.rotation[list(self.about)])
 
     def check(self, cameras: int, *, absolute: bool) -> None:
         """See `Source.check`."""

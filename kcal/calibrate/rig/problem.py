@@ -236,7 +236,6 @@ class RigProblem:
 
     def select(self, elements: Tensor) -> None:
         """See `Problem.select`: there is one element only."""
-        return
 
     def retract(self, state: State, step: State) -> RigState:
         """See `Problem.retract`."""
@@ -257,10 +256,7 @@ class RigProblem:
             )
             if self.unknowns.by_refraction is not None:
                 state = state._replace(refraction=state.refraction + self.unknowns.by_refraction @ change)
-        state = state._replace(
-            rotation=rotation_from_vector(turns) @ state.rotation,
-            center=state.center + shifts,
-        )
+        state = state._replace(rotation=rotation_from_vector(turns) @ state.rotation, center=state.center + shifts)
         steps = local.split([len(block) for block in self.blocks])
         moved = [
             block.moved(own.items, step[:, LOCAL_SIZE - block.size :])

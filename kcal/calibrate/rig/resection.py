@@ -27,29 +27,16 @@ def poses_from_three(rays: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     NaN where a solution is not real. Source: Grunert (1841), as written down by Haralick, Lee, Ottenberg and Nölle
     (1994), Int. J. Computer Vision 13 (3), Eq. 9 and 8.
     """
-
-    def squared(i: int, j: int) -> Tensor:
-        return (points[..., i, :] - points[..., j, :]).square().sum(-1)
-
-    def cosine(i: int, j: int) -> Tensor:
-        return (rays[..., i, :] * rays[..., j, :]).sum(-1)
-
-    aa, bb, cc = squared(1, 2), squared(0, 2), squared(0, 1)
-    alpha, beta, gamma = cosine(1, 2), cosine(0, 2), cosine(0, 1)
+    one, other = [1, 0, 0], [2, 2, 1]
+    aa, bb, cc = (points[..., one, :] - points[..., other, :]).square().sum(-1).unbind(-1)
+    alpha, beta, gamma = (rays[..., one, :] * rays[..., other, :]).sum(-1).unbind(-1)
     p, q, s, c = (aa - cc) / bb, (aa + cc) / bb, aa / bb, cc / bb
+    squares = p**2 - 1 + 2 * p**2 * beta**2 + 2 * (1 - c) * alpha**2
     quartic = torch.stack(
         [
             (p - 1) ** 2 - 4 * c * alpha**2,
             4 * (p * (1 - p) * beta - (1 - q) * alpha * gamma + 2 * c * alpha**2 * beta),
-            2
-            * (
-                p**2
-                - 1
-                + 2 * p**2 * beta**2
-                + 2 * (1 - c) * alpha**2
-                - 4 * q * alpha * beta * gamma
-                + 2 * (1 - s) * gamma**2
-            ),
+            2 * (squares - 4 * q * alpha * beta * gamma + 2 * (1 - s) * gamma**2),
             4 * (-p * (1 + p) * beta + 2 * s * gamma**2 * beta - (1 - q) * alpha * gamma),
             (1 + p) ** 2 - 4 * s * gamma**2,
         ],

@@ -20,12 +20,7 @@ from kcal.calibrate.problem.views import spread_out
 from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, all_of, possible
 from kcal.calibrate.rig.assess import rig_result
 from kcal.calibrate.rig.contradictions import widen_sources
-from kcal.calibrate.rig.explanations import (
-    cost_of_features_behind,
-    explained,
-    one_camera_doubts,
-    refuse_same_camera,
-)
+from kcal.calibrate.rig.explanations import cost_of_features_behind, explained, one_camera_doubts, refuse_same_camera
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
 from kcal.calibrate.rig.pairs import Pair, evenly, paired_boards, pose_alone
 from kcal.calibrate.rig.result import Reasons, RigResult, records

@@ -163,6 +163,12 @@ def require_positive(name: str, value: float) -> None:
         raise InputError(f"{name}: a positive number is needed, got {value}")
 
 
+def require_shape(name: str, value: Tensor | None, shape: tuple[int, ...]) -> None:
+    """Refuse a tensor of another shape."""
+    if value is not None and value.shape != shape:
+        raise InputError(f"{name} {shape} is needed, got {tuple(value.shape)}")
+
+
 def check_names(kind: str, names: tuple[str, ...], count: int) -> None:
     """Refuse names that are not one for each item, or that are there twice."""
     if len(names) != count:
@@ -352,8 +358,7 @@ class MarkSource(ItemSource):
             raise InputError(f"{kind}: pixel_sigma {tuple(shape[:2])} is needed, one for each mark")
         elif not bool((torch.isfinite(sigma) & (sigma > 0))[self.marked].all()):
             raise InputError(f"{kind}: pixel_sigma must be a positive number of pixels wherever there is a mark")
-        if self.covariance is not None and self.covariance.shape != (*shape, 2):
-            raise InputError(f"{kind}: a covariance {(*shape, 2)} is needed, got {tuple(self.covariance.shape)}")
+        require_shape(f"{kind}: a covariance", self.covariance, (*shape, 2))
         for effect in self.effects:
             shift, turn, factor = effect.shift, effect.turn, effect.factor
             good = shift is None or (shift.shape == (*shape[:2], self.axes) and bool(torch.isfinite(shift).all()))

@@ -29,6 +29,7 @@ from kcal.calibrate.rig.source import (
     as_items,
     check_names,
     require_positive,
+    require_shape,
     typical_ratio,
 )
 from kcal.checks import chi2_quantile
@@ -97,10 +98,7 @@ class Boards(ItemSource):
         return self.board.points if self.deviation is None else self.board.points + self.deviation
 
     def __post_init__(self) -> None:
-        if self.deviation is not None and self.deviation.shape != (self.board.corners, 3):
-            raise InputError(
-                f"boards: a deviation ({self.board.corners}, 3) is needed, got {tuple(self.deviation.shape)}"
-            )
+        require_shape("boards: a deviation", self.deviation, (self.board.corners, 3))
         if self.pixels.ndim != 4 or self.pixels.shape[2:] != (self.board.corners, 2):
             raise InputError(
                 f"boards: pixels (V, C, {self.board.corners}, 2) are needed, got {tuple(self.pixels.shape)}"
@@ -108,10 +106,7 @@ class Boards(ItemSource):
         check_names("boards", self.names, len(self.pixels))
         if self.views is not None and [len(own) for own in self.views] != [len(self.pixels)] * self.pixels.shape[1]:
             raise InputError("boards: a name of each camera's view is needed for every moment")
-        if self.covariance is not None and self.covariance.shape != (*self.pixels.shape, 2):
-            raise InputError(
-                f"boards: a covariance {(*self.pixels.shape, 2)} is needed, got {tuple(self.covariance.shape)}"
-            )
+        require_shape("boards: a covariance", self.covariance, (*self.pixels.shape, 2))
         if self.sigma is not None:
             require_positive("boards: sigma", self.sigma)
 
@@ -159,13 +154,8 @@ class Boards(ItemSource):
 
     def _each_camera_alone(self, mask: Tensor, given: Context) -> tuple[Tensor, Tensor]:
         """χ² of every board with a pose of its own for each camera, and how many degrees of freedom that costs."""
-        squares = torch.full(mask.shape, torch.nan, dtype=torch.float64)
-        squares[mask] = 0.0
-        further, weights, state = (
-            torch.zeros(mask.shape, dtype=torch.int64),
-            self.whitening(given.sigma_corner),
-            given.state,
-        )
+        squares, further = torch.where(mask, 0.0, torch.nan).double(), torch.zeros(mask.shape, dtype=torch.int64)
+        weights, state = self.whitening(given.sigma_corner), given.state
         turn, shift = board_pose(state.items)
         board = self.points
         if len(state.board):
@@ -326,6 +316,7 @@ class Baseline(Measurement):
     __repr__ = brief
 
     kind = "baselines"
+    count = 1
 
     first: int
     second: int
@@ -342,11 +333,6 @@ class Baseline(Measurement):
     def about(self) -> tuple[int, ...]:
         """See `Measurement.about`."""
         return self.first, self.second
-
-    @property
-    def count(self) -> int:
-        """See `Measurement.count`."""
-        return 1
 
     def rows_at(self, cameras: Sequence[PosedCamera], shared_size: int) -> Tensor:
         """See `Measurement.rows_at`."""
@@ -387,6 +373,7 @@ class MeasuredPosition(Measurement):
 
     kind = "positions"
     absolute = True
+    count = 3
 
     camera: int
     point: Tensor
@@ -402,11 +389,6 @@ class MeasuredPosition(Measurement):
     def about(self) -> tuple[int, ...]:
         """See `Measurement.about`."""
         return (self.camera,)
-
-    @property
-    def count(self) -> int:
-        """See `Measurement.count`."""
-        return 3
 
     def rows_at(self, cameras: Sequence[PosedCamera], shared_size: int) -> Tensor:
         """See `Measurement.rows_at`."""

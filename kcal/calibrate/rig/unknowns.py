@@ -127,24 +127,11 @@ def free(cameras: Sequence[Camera], names: Sequence[str]) -> SharedUnknowns:
             "hybrid cameras cannot be refined without what their own calibrations know: hold them, take what their "
             "calibrations know as prior, or calibrate parametric cameras"
         )
-    chosen = [free_parameters(camera.model) for camera in cameras]
-    count = sum(len(own) for own in chosen)
-    maps, labels, end = [], [], 0
-    for camera, own, name in zip(cameras, chosen, names, strict=True):
-        part = torch.zeros(len(camera.names), count, dtype=torch.float64)
-        for column, index in enumerate(own, start=end):
-            part[index, column] = 1.0
-            labels.append(f"{camera.names[index]} of {name}")
-        end += len(own)
-        maps.append(part)
-    return dataclasses.replace(
-        held(cameras),
-        cameras=tuple(maps),
-        board=torch.zeros(0, count, dtype=torch.float64),
-        begin=torch.zeros(count, dtype=torch.float64),
-        known=torch.zeros(count, dtype=torch.bool),
-        labels=tuple(labels),
-    )
+    chosen = [(camera, free_parameters(camera.model), name) for camera, name in zip(cameras, names, strict=True)]
+    labels = [f"{camera.names[index]} of {name}" for camera, own, name in chosen for index in own]
+    maps = torch.block_diag(*(torch.eye(len(camera.names), dtype=torch.float64)[:, own] for camera, own, _ in chosen))
+    found, _ = held(cameras)._and(*labels, known=False)
+    return dataclasses.replace(found, cameras=maps.split([len(camera.names) for camera in cameras]))
 
 
 # What the calibrations of a rig's cameras know, together: lenses, and the board that they saw, as one Gaussian.
@@ -232,9 +219,7 @@ def less(known: CameraInformation, rows: Tensor) -> CameraInformation:
     kept = values > 1e-10 * values[-1:].sum()
     root = values[kept].sqrt()
     return dataclasses.replace(
-        known,
-        rows=root[:, None] * vectors[:, kept].T / scale,
-        residuals=vectors[:, kept].T @ gradient / root,
+        known, rows=root[:, None] * vectors[:, kept].T / scale, residuals=vectors[:, kept].T @ gradient / root
     )
 
 
@@ -286,13 +271,11 @@ def joint_unknowns(
         corners = torch.einsum("bk,bcn->kcn", of_board, shapes).flatten(1)
         turns = _felt(cameras, given, _PX_PER_METER * corners, parts_known)
     # The unknowns of each camera, one after the other, and the board's: through these, lenses depend on each other.
-    columns, selected = torch.block_diag(*turns).split([len(known) for known in parts_known]), list[Tensor]()
-    for lens, own_columns in zip(given, columns, strict=False):
-        selected.append(lens.own @ own_columns + lens.by_board @ columns[-1])
+    *columns, last = torch.block_diag(*turns).split([len(known) for known in parts_known])
     found = SharedUnknowns(
-        cameras=tuple(selected),
+        cameras=tuple(lens.own @ own + lens.by_board @ last for lens, own in zip(given, columns, strict=True)),
         shapes=shapes,
-        board=of_board @ columns[-1],
+        board=of_board @ last,
         begin=torch.cat([turn.T @ begin for turn, begin in zip(turns, parts_begin, strict=True)]),
         known=torch.cat([(turn[known] != 0).any(0) for turn, known in zip(turns, parts_known, strict=True)]),
         labels=("",) * sum(turn.shape[1] for turn in turns),
