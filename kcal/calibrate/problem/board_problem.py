@@ -327,11 +327,7 @@ class BoardProblem(SchurProblem[BoardState]):
         return self._weighted(vectors, views)
 
     def corner_rows(self, state: BoardState, views: slice = ALL) -> Tensor:
-        """(..., V, L + S + 1, 2 K) as `rows`, of the corners alone, and as if no unknown were held.
-
-        With `memory` given, an empty list at first, the next call may overwrite what this one returns: new memory costs
-        as much time as what is written there.
-        """
+        """(..., V, L + S + 1, 2 K) as `rows`, of the corners alone, and as if no unknown were held."""
         rows, slopes = self._own_rows(state, views)
         if not self.displaced:
             return rows.flatten(-2)
@@ -341,7 +337,11 @@ class BoardProblem(SchurProblem[BoardState]):
         return torch.cat([rows[:, :-1], each, rows[:, -1:]], 1).flatten(-2)
 
     def _own_rows(self, state: BoardState, views: slice, memory: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
-        """Rows (..., V, L + S + 1, 2, K) without displacements of the corners; derivatives (V, 2, 2, K) by these."""
+        """Rows (..., V, L + S + 1, 2, K) without displacements of the corners; derivatives (V, 2, 2, K) by these.
+
+        With `memory` given, an empty list at first, the next call may overwrite what this one returns: new memory costs
+        as much time as what is written there.
+        """
         placed, seen, rotation, _ = self._imaged(state, views)
         error = seen.pixels - self._target[..., views, :, :]
         if self.joint:
