@@ -66,13 +66,8 @@ class BoardPrior(NamedTuple):
         known = BoardModes(shapes, unit, torch.full_like(modes.family, KNOWN))
         return off_by(points + torch.einsum("b,bkn->nk", mean, modes.shapes), self.corners), known
 
-    def in_amplitudes(self, units: Tensor) -> Tensor:
-        """(B,) amplitudes of the board's own modes, from the variables (B,) of `applied`."""
-        mean, half = self.whole.mean_and_half()
-        return mean + units @ half
-
     def in_units(self, amplitudes: Tensor) -> Tensor:
-        """The inverse of `in_amplitudes`."""
+        """(B,) the variables of `applied`, from the amplitudes (B,) of the board's own modes."""
         mean, half = self.whole.mean_and_half()
         return torch.linalg.solve_triangular(half, (amplitudes - mean)[None], upper=False, left=False)[0]
 
