@@ -124,13 +124,18 @@ class SolverStatus(enum.IntEnum):
     AT_BOUND = 7, "stopped at a bound: lower costs lie beyond what is allowed"
     FLAT = 8, "stopped where the cost is flat: the last steps lowered it by too little to matter"
 
-    message: str
+    _message: str
 
     def __new__(cls, value: int, message: str = "") -> Self:
-        """A number with its reason in words, `message`."""
+        """A number with its reason in words."""
         made = int.__new__(cls, value)
-        made._value_, made.message = value, message
+        made._value_, made._message = value, message
         return made
+
+    @property
+    def message(self) -> str:
+        """The reason in words."""
+        return self._message
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
