@@ -89,7 +89,8 @@ def as_points(
             "rounding with .double()"
         )
     if points.ndim < 1 or points.shape[-1] != last:
-        hint = "transpose it" if points.ndim == 2 and points.shape[0] == last else otherwise
+        turned = points.ndim == 2 and points.shape[0] == last
+        hint = "transpose it" if turned else otherwise
         raise InputError(
             "; ".join(filter(None, [f"{name}: shape (..., {last}) is needed, got {tuple(points.shape)}", hint]))
         )
@@ -259,7 +260,8 @@ def chi2_quantile(freedom: Tensor | float, probability: float) -> Tensor:
     from scipy.special import chdtri
 
     given = torch.as_tensor(freedom, dtype=torch.float64)
-    return torch.where(given > 0, torch.as_tensor(chdtri(given.clamp_min(1e-9).numpy(), 1.0 - probability)), 0.0)
+    found = torch.as_tensor(chdtri(given.clamp_min(1e-9).numpy(), 1.0 - probability))
+    return torch.where(given > 0, found, 0.0)
 
 
 def chi2_tail(chi2: Tensor | float, freedom: Tensor | float) -> Tensor:

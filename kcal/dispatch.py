@@ -96,7 +96,8 @@ def still(module: Module) -> Module:
     """The module, or where anything of it is differentiated, a copy with the same values out of every graph."""
     if not is_differentiated(module):
         return module
-    return copy.deepcopy(module, {id(tensor): tensor.detach() for tensor in [*module.parameters(), *module.buffers()]})
+    tensors = [*module.parameters(), *module.buffers()]
+    return copy.deepcopy(module, {id(tensor): tensor.detach() for tensor in tensors})
 
 
 def host_values(tensor: Tensor) -> np.ndarray:

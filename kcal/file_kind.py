@@ -277,7 +277,8 @@ def _pnm(data: bytes) -> Size:
 
 
 def _jpeg2000(data: bytes) -> Size:
-    right, bottom, left, top = struct.unpack_from(">IIII", data, data.index(b"\xff\x4f\xff\x51") + 8)
+    at = data.index(b"\xff\x4f\xff\x51")
+    right, bottom, left, top = struct.unpack_from(">IIII", data, at + 8)
     return right - left, bottom - top
 
 

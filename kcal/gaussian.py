@@ -182,7 +182,8 @@ def stacked(gaussians: Sequence[Gaussian]) -> Gaussian:
 
 def triangular(rows: Tensor) -> Tensor:
     """(C, C) upper triangle with the same products as rows (R, C)."""
-    padded = torch.cat([rows, rows.new_zeros(max(0, rows.shape[1] - len(rows)), rows.shape[1])])
+    missing = max(0, rows.shape[1] - len(rows))
+    padded = torch.cat([rows, rows.new_zeros(missing, rows.shape[1])])
     return torch.linalg.qr(padded, mode="r")[1]
 
 

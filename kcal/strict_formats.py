@@ -214,7 +214,8 @@ def _array(reader: _Reader, depth: int) -> tuple[str, Any]:
         name_of_coding = {1: "utf-8", 2: "utf-8", 16: "utf-8", 4: "utf-16", 17: "utf-16", 18: "utf-32"}.get(coding)
         if name_of_coding is None:
             raise ValueError(f"{name}: characters of kind {coding}")
-        suffix = "" if name_of_coding == "utf-8" else {"<": "-le", ">": "-be"}[reader.order]
+        endings = {"<": "-le", ">": "-be"}
+        suffix = "" if name_of_coding == "utf-8" else endings[reader.order]
         return name, text.decode(name_of_coding + suffix, "replace")
     if kind in _NUMBERS:
         values = reader.values()
@@ -340,7 +341,8 @@ def _plain(value: Any) -> Any:
 def _of_element(element: Element) -> Any:
     children = list(element)
     if not children:
-        values = [_scalar(part) for part in re.findall(r'"(?:[^"\\]|\\.)*"|[^\s"]+', element.text or "")]
+        parts = re.findall(r'"(?:[^"\\]|\\.)*"|[^\s"]+', element.text or "")
+        values = [_scalar(part) for part in parts]
         if len(values) == 1:
             return values[0]
         numbers = all(isinstance(value, float) for value in values)

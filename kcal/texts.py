@@ -116,7 +116,8 @@ def page_data(value: Any) -> str:
         >>> page_data({"name": "<!--<script>"})
         '{"name": "\\u003c!--\\u003cscript\\u003e"}'
     """
-    return json.dumps(value, allow_nan=False).replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
+    text = json.dumps(value, allow_nan=False)
+    return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
 
 
 def page_policy(*, scripts: Iterable[str] = (), styles: Iterable[str] = (), images: str = "data:") -> str:

@@ -241,7 +241,8 @@ def compare_command(
         result = kcal.calibrate.compare_models(
             seen, names, groups="views" if groups == "views" else "blocks", parts=parts, progress=advance
         )
-    out.print(f"{len(seen.views)} views; held out in {len(result.corners)} groups, {parts} parts; RMS per corner")
+    count = len(result.corners)
+    out.print(f"{len(seen.views)} views; held out in {count} groups, {parts} parts; RMS per corner")
     columns: Columns = {
         "model": "model", "held_out_rms_px": "held-out RMS, px", "more_than_best_px": "more than the best, px",
         "standard_error_px": "± standard error",
@@ -437,7 +438,11 @@ def file_schema(kind: str) -> dict[str, Any]:
     module, name, _ = FILES[kind]
     file = getattr(importlib.import_module(module), name)
     schema = file.model_json_schema(mode="serialization")
-    schema["properties"] = {"kcal": {"const": file.KIND}, "version": {"const": file.VERSION}, **schema["properties"]}
+    schema["properties"] = {
+        "kcal": {"const": file.KIND},
+        "version": {"const": file.VERSION},
+        **schema["properties"],
+    }
     # All fields of the version's first files are written, so that a reader need not know their defaults.
     schema["required"] = [name for name in schema["properties"] if name not in file._LATER]
     return {

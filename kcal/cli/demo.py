@@ -180,7 +180,8 @@ def real_pairs(
     output: Path, folder: Path, size: str, square: str, board: kcal.Board, origin: kcal.Origin | None, heading: float
 ) -> None:
     """Calibrate from a folder of pairs, and locate two opposite corners of each board, whose distance is known."""
-    _calibrate_both(output, {side: _side_images(folder, side) for side in SIDES}, ("--board", size, "--square", square))
+    images = {side: _side_images(folder, side) for side in SIDES}
+    _calibrate_both(output, images, ("--board", size, "--square", square))
     cameras, seen = ([output / f"{side}.{kind}.json" for side in SIDES] for kind in ("camera", "obs"))
     # Few pairs: none is left out, so that each board can be compared.
     run("rig", *cameras, "--pairs", *seen, "--keep-all", "-o", output / "rig.json")

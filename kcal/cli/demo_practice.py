@@ -121,7 +121,8 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
         FileError: the folder has other files, or a site of another seed.
     """
     check_folder(folder, seed)
-    site = practice.PracticeSite(practice.practice_scene(seed, views, scale))
+    scene = practice.practice_scene(seed, views, scale)
+    site = practice.PracticeSite(scene)
     parts = list(_practice_parts(site, frames))
     missing = [(path, work, write) for path, work, write in parts if not (folder / path).exists()]
     done = 0

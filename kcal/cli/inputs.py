@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
-import re
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -160,7 +159,9 @@ OBSERVATIONS = Wanted(
     _FROM_IMAGES,
 )
 SHOWN = dataclasses.replace(
-    ANY_CAMERA, words="a camera, rig or observations file", kinds=ANY_CAMERA.kinds | {"observations"}
+    ANY_CAMERA,
+    words="a camera, rig or observations file",
+    kinds=ANY_CAMERA.kinds | {"observations"},
 )
 BOARD = Wanted(
     "a kcal board file",
@@ -237,7 +238,8 @@ def given_texts(value: Any) -> list[str]:
 
 def given_files(value: Any) -> list[str]:
     """The files and folders among it."""
-    return [path for text in given_texts(value) for path in (text, text.rpartition(":")[0]) if os.path.exists(path)]
+    texts = given_texts(value)
+    return [path for text in texts for path in (text, text.rpartition(":")[0]) if os.path.exists(path)]
 
 
 def check_given(files: Sequence[tuple[str, Wanted, Any]]) -> None:
@@ -290,8 +292,13 @@ def check_kinds(found: Sequence[_Given]) -> None:
 
 def typed_with(exchange: dict[str, str], *more: str) -> str:
     """The command as it was typed, with other files and with more words: it can be pasted."""
-    parts = (re.findall(r"\A(--[^=]*=)?(.*)\Z", word, re.DOTALL)[0] for word in typed)
-    words = [option + exchange.get(value, value) for option, value in parts]
+    words = []
+    for word in typed:
+        option, equals, value = word.partition("=")
+        if equals and word.startswith("--"):
+            words.append(f"{option}={exchange.get(value, value)}")
+        else:
+            words.append(exchange.get(word, word))
     return f"kcal {shlex.join([*words, *more])}"
 
 

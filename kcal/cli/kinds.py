@@ -156,7 +156,8 @@ RefineMethod = Annotated[
 
 
 Needs = Annotated[
-    tuple[Any, ...], Kind(metavar="RANGE:ERROR", read=lambda text, _: kcal.report.Requirement.parse(text), setting=True)
+    tuple[Any, ...],
+    Kind(metavar="RANGE:ERROR", read=lambda text, _: kcal.report.Requirement.parse(text), setting=True),
 ]
 
 

@@ -36,7 +36,8 @@ def _print_positions(
     located: rooms.Located, true: rooms.Tensor | None, statuses: dict[str, int], *, stated: bool
 ) -> None:
     """Print the table with the reasons below it; of a long one the counts, and the rows that have a true position."""
-    rows = rooms.position_rows(located, None if true is None else rooms.position_errors(located, true))
+    errors = None if true is None else rooms.position_errors(located, true)
+    rows = rooms.position_rows(located, errors)
     shown: Sequence[int] = range(len(located.positions))
     if located.rows is not None:
         out.print(counts_text(located.rows, statuses))
@@ -122,7 +123,8 @@ def locate_run(rig: Path, points: Path, own: LocateOptions) -> tuple[rooms.Point
         table does not state it.
     """
     solved = kcal.load_rig(rig)
-    many = own.height is not None or own.terrain is not None or rooms.is_long(points) or not solved.is_pair
+    stated = own.height is not None or own.terrain is not None
+    many = stated or rooms.is_long(points) or not solved.is_pair
     if many:
         refuse_of_pairs(own)
     elif own.aged is not None and own.history is not None:

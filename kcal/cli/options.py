@@ -416,7 +416,8 @@ class Command(TyperCommand):
             if text := whole.get_help(ctx):
                 print(text)
             ctx.exit()
-        return super().parse_args(ctx, self._spread(["--help" if word == "--help-all" else word for word in args]))
+        words = ["--help" if word == "--help-all" else word for word in args]
+        return super().parse_args(ctx, self._spread(words))
 
     def _spread(self, words: list[str]) -> list[str]:
         """Each value of an option that takes several with the flag before it, as typer wants them.
@@ -456,7 +457,11 @@ class Command(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; what it takes from kcal.toml is said first, in one line."""
-        names = [one.name for one in self.params if "DEFAULT_MAP" in repr(ctx.get_parameter_source(one.name))]
+        names = [
+            param.name
+            for param in self.params
+            if getattr(ctx.get_parameter_source(param.name), "name", "") == "DEFAULT_MAP"
+        ]
         taken.clear()
         taken.update(names)
         if names:

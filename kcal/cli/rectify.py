@@ -330,7 +330,8 @@ def _tell_ranges(module: kcal.lens.StereoRectification) -> None:
     # Distances from the camera, of which the depth is a part.
     ahead = float(torch.hypot(torch.hypot(where[0, 0] - cx, where[0, 1] - cy), torch.tensor(focal))) / focal
     ranges = rooms.usual_ranges(module.rig)
-    disparity = focal * float(module.right_center[:2].sum()) * ahead / torch.tensor(ranges, dtype=torch.float64)
+    apart = float(module.right_center[:2].sum())
+    disparity = focal * apart * ahead / torch.tensor(ranges, dtype=torch.float64)
     found = kcal.locate.DisparityRanges(module, disparity_sigma=_DISPARITY_SIGMA).at(
         where.expand(len(ranges), 2), disparity
     )
@@ -392,7 +393,8 @@ def rays_command(sources: list[kinds.AnyFile], *, output: Annotated[kinds.NewFil
     moved = float((module.depths * module.mask).abs().max())
     width, height = cameras[0].size
     share = float(module.mask.double().mean())
-    out.print(f"rays {len(cameras)} x {height} x {width} x 6, float32; {100 * share:.1f} % of the pixels have one")
+    text = f"rays {len(cameras)} x {height} x {width} x 6, float32; {100 * share:.1f} % of the pixels have one"
+    out.print(text)
     out.print(f"rounding: at most {error:.1e} px from the pixel, at 1 m and far away")
     if moved:
         out.print(f"the rays start up to {1e3 * moved:.3g} mm from each other on the axis: the entrance pupil moves")

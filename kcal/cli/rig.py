@@ -231,7 +231,10 @@ _OF_ONE = (
 
 
 def station_command(
-    camera: kinds.CalibratedCamera, *, output: kinds.NewFile, sources: Annotated[Sources, Only(_OF_ONE)]
+    camera: kinds.CalibratedCamera,
+    *,
+    output: kinds.NewFile,
+    sources: Annotated[Sources, Only(_OF_ONE)],
 ) -> None:
     """Solve how one camera stands on the Earth: position, heading, pitch and roll, with error bars.
 

@@ -168,7 +168,8 @@ def _by_stars(
         raise InputError("--site without --time tells nothing: refraction depends on both")
     files = rooms.expand_nights(images)
     check_writable(output, *files)
-    found, size = camera_by_stars(files, [night.view(path) for path in files], "calibrating by stars", boards)
+    views = [night.view(path) for path in files]
+    found, size = camera_by_stars(files, views, "calibrating by stars", boards)
     count = sum(int(use.sum()) for use in found.lens.used)
     left_out = sum(len(use) for use in found.lens.used) - count
     tell(
@@ -310,7 +311,8 @@ def _told(path: Path, found: rooms.NamedStars) -> dict[str, Any]:
 
 
 def _draw(picture: Path, image: Any, found: rooms.NamedStars, catalog: kcal.stars.StarCatalog, title: str) -> None:
-    names = [catalog.name_of(int(catalog.number[i])) if i >= 0 else "" for i in found.attitude.star.tolist()]
+    star = found.attitude.star.tolist()
+    names = [catalog.name_of(int(catalog.number[i])) if i >= 0 else "" for i in star]
     kcal.report.save_picture(
         picture, rooms.stars_figure(image, found.detected.pixels, names, found.attitude.residual, title)
     )

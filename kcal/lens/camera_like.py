@@ -101,7 +101,8 @@ class AdaptedCamera(Float64Module):
     def center(self) -> Tensor:
         """(2,) the pixel of the optical axis; the middle of the image if the axis has none."""
         pixel, valid = self.camera.project(self.params.new_tensor([[0.0, 0.0, 1.0]]))
-        return torch.where(valid[:, None], pixel, 0.5 * (self.params.new_tensor(self.size) - 1.0))[0]
+        middle = 0.5 * (self.params.new_tensor(self.size) - 1.0)
+        return torch.where(valid[:, None], pixel, middle)[0]
 
     @property
     def fingerprint(self) -> str:
@@ -395,7 +396,10 @@ class CameraRays(Float64Module):
                 raise InputError("viewmats: the left part of a matrix is no rotation; scales belong into the scene")
             turn, shift = rotation[..., None, None, :, :], translation[..., None, None, :]
             # Row vectors times R are Rᵀ v: from the camera to the world.
-            moved = (((origins - shift)[..., None, :] @ turn)[..., 0, :], (directions[..., None, :] @ turn)[..., 0, :])
+            moved = (
+                ((origins - shift)[..., None, :] @ turn)[..., 0, :],
+                (directions[..., None, :] @ turn)[..., 0, :],
+            )
             rays = torch.cat(moved, -1)
         return torch.where(mask[..., None], rays, 0.0).to(dtype)
 

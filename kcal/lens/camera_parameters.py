@@ -48,7 +48,8 @@ class LensParameters(Operations, StatedModule):
         parameters = as_points(what, parameters, len(self.names))
         require_finite(what, parameters)
         self.params = nn.Parameter(parameters.detach().clone(), requires_grad=False)
-        self.register_buffer("free_mask", torch.ones(len(self.names), dtype=torch.bool, device=parameters.device))
+        free = torch.ones(len(self.names), dtype=torch.bool, device=parameters.device)
+        self.register_buffer("free_mask", free)
 
     def _measure_region(self) -> None:
         """Register what follows from the parameters, and so is not part of the saved state."""

@@ -215,7 +215,13 @@ def _fit(
 
 
 def _judged(
-    first: Camera, second: Camera, places: tuple[Tensor, Tensor], away: Tensor, weight: Tensor, at: float, freedom: int
+    first: Camera,
+    second: Camera,
+    places: tuple[Tensor, Tensor],
+    away: Tensor,
+    weight: Tensor,
+    at: float,
+    freedom: int,
 ) -> tuple[Tensor | None, float | None, float | None]:
     """Sigma (N,) of the shift, its RMS over what is expected, and the probability of as large a shift by chance."""
     roots = []

@@ -175,7 +175,8 @@ def _matrix(series: Mapping[int, np.ndarray]) -> Tensor:
         for k, weight in enumerate(part @ shifted_powers(len(part))):
             total += weight * _powers_of_z(max(j, 0) + k, max(-j, 0) + k, degree)
     # [power of y, u or v, power of x]
-    return torch.from_numpy(np.stack([total.real, total.imag], 1).reshape(2 * (degree + 1), degree + 1))
+    both = np.stack([total.real, total.imag], 1)
+    return torch.from_numpy(both.reshape(2 * (degree + 1), degree + 1))
 
 
 @functools.cache
@@ -314,7 +315,8 @@ class Backward(NamedTuple):
 
 def _planes(points: Tensor) -> tuple[Tensor, ...]:
     """The coordinates of points (n, K), each in its own memory; NumPy copies four times as fast."""
-    return torch.from_numpy(np.ascontiguousarray(points.numpy().T)).unbind()
+    array = points.numpy()
+    return torch.from_numpy(np.ascontiguousarray(array.T)).unbind()
 
 
 def _within(*limits: tuple[Tensor, float]) -> Tensor | None:
@@ -325,7 +327,10 @@ def _within(*limits: tuple[Tensor, float]) -> Tensor | None:
 
 
 def map_points(
-    polynomials: Forward | Backward, formulas: Callable[[Tensor], tuple[Tensor, Tensor]], points: Tensor, width: int
+    polynomials: Forward | Backward,
+    formulas: Callable[[Tensor], tuple[Tensor, Tensor]],
+    points: Tensor,
+    width: int,
 ) -> tuple[Tensor, Tensor]:
     """Map points (..., N, K) to values (..., N, width) and valid (..., N): by `formulas` where not by `polynomials`."""
     flat = points.detach().reshape(-1, points.shape[-1])
@@ -505,7 +510,8 @@ def _forward_error(forward: Forward, parameters: Tensor, model: LensModel) -> fl
     across = 2.0 * torch.sqrt(square) / (1.0 + square) * distance
     X, Y, Z = across * torch.cos(turn), across * torch.sin(turn), (1.0 - square) / (1.0 + square) * distance
     pixels, found = forward(torch.stack([X, Y, Z], -1), X.new_empty((forward.rows, len(X))))
-    moved = ray_starts(X, Y, Z, parameters[len(INTRINSICS) :]).moved(X, Y, Z)
+    coefficients = parameters[len(INTRINSICS) :]
+    moved = ray_starts(X, Y, Z, coefficients).moved(X, Y, Z)
     return _largest_distance(*moved, pixels, found, parameters, model)
 
 

@@ -541,5 +541,6 @@ def _common_pinhole(cameras: tuple[TurnedCamera, TurnedCamera], alpha: float, si
         scale = last / (high - low)
         focal = focal + share * (scale.max() if inner else scale.min())
         middle = middle + share * 0.5 * (low + high)
-    values = torch.cat([focal[None], focal[None], 0.5 * last - focal * middle, torch.zeros_like(focal[None])])
+    center = 0.5 * last - focal * middle
+    values = torch.cat([focal[None], focal[None], center, torch.zeros_like(focal[None])])
     return Camera(values, size=size, model="pinhole")

@@ -122,7 +122,8 @@ def start_from(x: Tensor, y: Tensor, model: LensModel, start: Tensor) -> tuple[T
     if not (model.numerator or model.denominator or model.hybrid):
         return x, y
     largest, constant, *rest = unbind_last(start)
-    variable = 2.0 * torch.sqrt(torch.clamp(1.0 - torch.addcmul(x * x, y, y) / largest, min=0.0)) - 1.0
+    square = torch.addcmul(x * x, y, y)
+    variable = 2.0 * torch.sqrt(torch.clamp(1.0 - square / largest, min=0.0)) - 1.0
     ratio, _ = polynomial(variable, rest, 0.0, False)
     ratio = ratio + constant
     return x * ratio, y * ratio

@@ -218,7 +218,8 @@ def hybrid_terms(
         lead = torch.stack([by_bend * x, by_bend * y], -2)[..., None, :, :]
         columns = torch.cat([lead, torch.zeros_like(lead).expand(*(-1,) * (lead.ndim - 3), offset - 1, -1, -1)], -3)
         if max(wanted) >= offset:
-            columns = torch.cat([columns, form.modes.columns(x * to_disc, y * to_disc).movedim((0, 1), (-3, -2))], -3)
+            fields = form.modes.columns(x * to_disc, y * to_disc).movedim((0, 1), (-3, -2))
+            columns = torch.cat([columns, fields], -3)
         if list(wanted) != list(range(columns.shape[-3])):
             columns = columns[..., list(wanted), :, :]
     else:
@@ -475,7 +476,13 @@ def polynomial(s: Tensor, coefficients: Sequence[Tensor], constant: float, slope
 
 
 def distort_components(
-    x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel, wanted: Sequence[int] = (), *, slopes: bool = True
+    x: Tensor,
+    y: Tensor,
+    coefficients: Tensor,
+    model: LensModel,
+    wanted: Sequence[int] = (),
+    *,
+    slopes: bool = True,
 ) -> Distorted:
     """Distort separate coordinates x, y (..., N), with the derivatives that are asked for.
 

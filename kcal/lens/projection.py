@@ -98,7 +98,10 @@ def plane_with_slopes(X: Tensor, Y: Tensor, Z: Tensor, model: LensModel) -> tupl
     depth = torch.where(near, Z, 1.0)
     nearby = series(_ARCTAN_SLOPE, torch.where(near, square / (depth * depth), 0.0)) / (depth * depth * depth)
     h = torch.where(near, nearby, (Z * by_distance - ratio) / torch.where(near, 1.0, square))
-    return ratio * X, ratio * Y, ratio + X * X * h, X * Y * h, ratio + Y * Y * h, -X * by_distance, -Y * by_distance
+    cross = X * Y * h
+    return (
+        ratio * X, ratio * Y, ratio + X * X * h, cross, ratio + Y * Y * h, -X * by_distance, -Y * by_distance,
+    )  # fmt: skip
 
 
 def _base_with_slopes(
@@ -406,7 +409,8 @@ def project_components(
         moved = pupil.moved(X, Y, Z)
     x, y, x_X, x_Y, y_Y, x_Z, y_Z = plane_with_slopes(*moved, model)
     plane = torch.stack([x, y], -2) if model.hybrid and wanted is not None else None
-    lens = distort_components(x, y, parameters[..., offset:], model, [i - offset for i in wanted or () if i >= offset])
+    lens_wanted = [i - offset for i in wanted or () if i >= offset]
+    lens = distort_components(x, y, parameters[..., offset:], model, lens_wanted)
     fx, fy, _, _, skew = unbind_last(parameters[..., :offset])
     regular = lens.positive & (lens.determinant > 0)
     if pupil:
@@ -451,7 +455,8 @@ def project_components(
         by_lens = torch.stack([torch.addcmul(across * du, along, dv), down * dv], -2)
     # In the order of `wanted`: intrinsics come first as a rule.
     first = as_columns([intrinsic[i] for i in wanted if i < offset], pixels[..., 0, :])
-    by_camera = torch.cat([part.expand(*pixels.shape[:-2], -1, -1, -1) for part in (first, by_lens)], -3)
+    whole = pixels.shape[:-2]
+    by_camera = torch.cat([part.expand(*whole, -1, -1, -1) for part in (first, by_lens)], -3)
     order = sorted(range(len(wanted)), key=lambda k: wanted[k] >= offset)
     if order != list(range(len(wanted))):
         by_camera = by_camera[..., [order.index(k) for k in range(len(wanted))], :, :]

@@ -299,7 +299,12 @@ def sampled_region(coefficients: Tensor, model: LensModel, limits: Tensor, singl
 
 
 def in_region(
-    x: Tensor, y: Tensor, coefficients: Tensor, model: LensModel, region: Region, lens: Distorted | None = None
+    x: Tensor,
+    y: Tensor,
+    coefficients: Tensor,
+    model: LensModel,
+    region: Region,
+    lens: Distorted | None = None,
 ) -> Tensor:
     """Whether points (..., N) of the plane lie in the valid region.
 

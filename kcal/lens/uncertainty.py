@@ -71,8 +71,9 @@ def pixel_covariance(
     wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
     half = known.by_parameter(known.half())[:, wanted]
     by_camera, by_motion, good = pixel_slopes(camera, camera.grid(*grid).reshape(-1, 2), math.inf, wanted)
+    by_turn = by_motion[..., :3]
     # The turn that best undoes each parameter's effect.
-    undo = torch.linalg.lstsq(by_motion[..., :3][good].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
+    undo = torch.linalg.lstsq(by_turn[good].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
     by_camera, by_motion, good = pixel_slopes(camera, flat, at, wanted)
     by_camera = by_camera - by_motion[..., :3] @ undo
     spread = by_camera @ half.T
@@ -105,7 +106,8 @@ def pixel_errors(camera: Camera, truth: Camera, places: Tensor, *, at: float = m
 
     def seen_apart(pixels: Tensor, at: float) -> Tensor:
         rays, valid = camera.unproject(pixels)
-        seen, visible = truth.project(FAR * rays if math.isinf(at) else camera.ray_origins(rays) + at * rays)
+        points = FAR * rays if math.isinf(at) else camera.ray_origins(rays) + at * rays
+        seen, visible = truth.project(points)
         return torch.where((valid & visible)[:, None], pixels - seen, torch.nan)
 
     everywhere = camera.grid(25, 17).reshape(-1, 2)

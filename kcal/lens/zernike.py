@@ -117,7 +117,8 @@ class ZernikeProducts(NamedTuple):
         if scale is not None:
             pairs = pairs * scale
         # Rows at a time: these tables are large, and bound by memory.
-        return torch.index_select(pairs, 0, self.pair, out=out).mul_(profiles.index_select(0, self.profile))
+        found = torch.index_select(pairs, 0, self.pair, out=out)
+        return found.mul_(profiles.index_select(0, self.profile))
 
     def field(self, weights: Tensor, x: Tensor, y: Tensor, slopes: bool) -> tuple[Tensor, ...]:
         """As `FieldModes.field`."""
@@ -405,7 +406,10 @@ def _times_plus(value: _Complex, z: _Complex, added: _Complex, reuse: bool) -> _
     (a, b), (x, y), (p, q) = value, z, added
     if reuse and p.shape == q.shape == x.shape and all(part.ndim == 0 or part.shape == x.shape for part in (a, b)):
         return p.addcmul_(a, x).addcmul_(b, y, value=-1.0), q.addcmul_(b, x).addcmul_(a, y)
-    return (torch.addcmul(torch.addcmul(p, a, x), b, y, value=-1.0), torch.addcmul(torch.addcmul(q, b, x), a, y))
+    return (
+        torch.addcmul(torch.addcmul(p, a, x), b, y, value=-1.0),
+        torch.addcmul(torch.addcmul(q, b, x), a, y),
+    )
 
 
 @functools.cache

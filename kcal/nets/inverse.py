@@ -226,7 +226,8 @@ class InverseNet(Network):
         """Map undistorted coordinates (..., N) to the network's chart."""
         if self.model.fisheye:
             return x, y
-        scale = 2.0 * (1.0 + torch.sqrt(1.0 + torch.addcmul(x * x, y, y))).reciprocal()
+        square = torch.addcmul(x * x, y, y)
+        scale = 2.0 * (1.0 + torch.sqrt(1.0 + square)).reciprocal()
         return x * scale, y * scale
 
     def from_chart(self, p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -378,7 +379,8 @@ def _training_pixels(camera: Camera, counts: tuple[int, int]) -> Tensor:
     for size, count in zip(camera.size, counts, strict=True):
         place = -torch.cos(math.pi * (torch.arange(count, dtype=torch.float64) + 0.5) / count)
         axes.append(0.5 * (size - 1) + 0.5 * size * 1.05 * place)
-    return torch.stack(torch.meshgrid(*axes, indexing="xy"), -1).reshape(-1, 2).to(camera.params.device)
+    grid = torch.stack(torch.meshgrid(*axes, indexing="xy"), -1).reshape(-1, 2)
+    return grid.to(camera.params.device)
 
 
 def _distorted(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:

@@ -348,7 +348,8 @@ class _JointProblem(SchurProblem):
         distorted = _before_intrinsics(seen.pixels, parameters)
         net = evaluate(distorted / self._inverse.reach, state[1], self._inverse.widths)
         after = distorted + self._inverse.amplitude * net
-        return torch.where(seen.regular, seen.pixels - self._corners, torch.nan), self._focal * (after - self._before)
+        error = torch.where(seen.regular, seen.pixels - self._corners, torch.nan)
+        return error, self._focal * (after - self._before)
 
     def rms(self, errors: Tensor) -> float:
         """sqrt(mean ‖e‖²) of errors (2, M), all counting alike."""

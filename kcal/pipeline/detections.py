@@ -94,8 +94,11 @@ def _from_array(source: Any) -> Raw:
         raise InputError(
             f"detections: shape (N, 4) to (N, 6) of x1, y1, x2, y2, score, class is needed, got {tuple(table.shape)}"
         )
-    score, category = [*table.T[4:], None, None][:2]
-    return dict(boxes=table[:, :4], score=score, category=None if category is None else category.tolist())
+    return dict(
+        boxes=table[:, :4],
+        score=table[:, 4] if table.shape[1] > 4 else None,
+        category=table[:, 5].tolist() if table.shape[1] > 5 else None,
+    )
 
 
 def _from_dict(source: Mapping[str, Any]) -> Raw:

@@ -54,7 +54,8 @@ def line_errors(rig: Rig, pixels: Tensor) -> LineErrors:
     # right · (shift x left) is what is off: a turn adds turn x left to left, a shift adds to shift.
     turned = -torch.linalg.cross(torch.linalg.cross(right, shift), left)
     axes = rig.baseline * torch.cat(side_axes(rig.right_from_left_translation[None] / rig.baseline))
-    slopes = torch.cat([turned, torch.linalg.cross(left, right) @ axes.T], 1) / per_px
+    shifted = torch.linalg.cross(left, right) @ axes.T
+    slopes = torch.cat([turned, shifted], 1) / per_px
     return LineErrors((right * normal).sum(-1) / per_px[:, 0], slope / per_px, slopes)
 
 
@@ -143,7 +144,8 @@ def with_common_errors(
 def _classes(share: Tensor, pairs: int) -> Tensor:
     """(M,) number of the class, each with as many."""
     count = max(1, min(_CLASSES, len(share) // (pairs * _FEWEST)))
-    return torch.bucketize(share, share.quantile(torch.arange(1, count, dtype=torch.float64) / count))
+    edges = share.quantile(torch.arange(1, count, dtype=torch.float64) / count)
+    return torch.bucketize(share, edges)
 
 
 def smooth_columns(pixels: Tensor) -> Tensor:

@@ -140,7 +140,8 @@ def _both_ways(
         column_score[columns[better]] = values[better]
         best[1][columns[better]] = rows[at[better]]
     index = (clear & (best[0] >= 0)).nonzero()[:, 0]
-    return torch.stack([index, best[0][index]], 1)[best[1][best[0][index]] == index]
+    mutual = best[1][best[0][index]] == index
+    return torch.stack([index, best[0][index]], 1)[mutual]
 
 
 # Keypoints of an image: more tell little more and cost as much again.
@@ -359,7 +360,8 @@ def as_floats(pair: ImagePair) -> tuple[Tensor, Tensor]:
 
 def _posed(rig: Rig, pixels: Tensor, covariance: Tensor) -> tuple[Rig, Tensor]:
     """The rig (baseline of one) that most of the matches make, and each one's χ² over its limit."""
-    features = _features(tuple(map(str, range(len(pixels)))), pixels, covariance)
+    count = len(pixels)
+    features = _features(tuple(map(str, range(count))), pixels, covariance)
     cameras = rig.left, rig.right
     scale = Baseline(first=0, second=1, length=1.0, sigma=_UNIT_SIGMA)
     data = RigData(cameras=cameras, names=("left", "right"), features=features, baselines=(scale,))
@@ -375,7 +377,8 @@ def _posed(rig: Rig, pixels: Tensor, covariance: Tensor) -> tuple[Rig, Tensor]:
     # What has no projection, or is behind both cameras.
     over = torch.where(mask & (work.state.items[:, 3] >= -_UNIT_SIGMA), over, torch.inf)
     rotation, center = work.state.rotation, work.state.center
-    return Rig.pair(*cameras, rotation[1] @ rotation[0].T, rotation[1] @ (center[0] - center[1])), over
+    relative = rotation[1] @ rotation[0].T
+    return Rig.pair(*cameras, relative, rotation[1] @ (center[0] - center[1])), over
 
 
 def _still(pairs: Sequence[ImagePair], found: Sequence[MatchedPair], k: int) -> MatchedPair:

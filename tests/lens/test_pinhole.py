@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from image_cameras import BARREL, F64, FOLDING, PINCUSHION, build
-from lenses import FEW_MODES, HYBRID, KINDS, MODELS, hybrid_camera, parameters, strong
+from lenses import FEW_MODES, HYBRID, KINDS, MODELS, distort_with_jacobian, hybrid_camera, parameters, strong
 from torch import Tensor, nn
 from torch.autograd import gradcheck, gradgradcheck
 from torch.func import functional_call, jacrev
@@ -20,6 +20,7 @@ from kcal import Camera, DegenerateError, InputError
 from kcal.lens import CameraCalibration
 from kcal.lens.images import NOWHERE, undistort_maps
 from kcal.lens.information import CameraInformation
+from kcal.lens.inverse import undistort
 from kcal.lens.model import PRESETS, LensModel
 from kcal.lens.projection import FAR, project_components
 from kcal.lens.uncertainty import ParaxialFocal, paraxial_focal
@@ -206,6 +207,30 @@ def test_second_derivatives_of_the_inverse(model: str | LensModel) -> None:
     pixels = camera.project(POINTS)[0].requires_grad_(True)
     vector.requires_grad_(True)
     assert gradgradcheck(of_parameters(camera, "unproject"), (pixels, vector), eps=1e-6, atol=1e-7, rtol=1e-5)
+
+
+@pytest.mark.parametrize("model", [*MODELS, HYBRID], ids=str)
+def test_inverse_has_the_inverse_jacobian(model: str | LensModel) -> None:
+    """The implicit function theorem, written out: dx/dx_D = J⁻¹ and dx/dc = -J⁻¹ ∂x_D/∂c."""
+    lens = strong(model)
+    normalized = POINTS[:, :2] / POINTS[:, 2:]
+    distorted, by_point, by_coefficients = distort_with_jacobian(normalized, lens, model)
+    inverse = torch.linalg.inv(by_point)
+    for n in range(len(POINTS)):
+
+        def solve(target: Tensor, coefficients: Tensor) -> Tensor:
+            return undistort(target[None], coefficients, model)[0][0]
+
+        target = distorted[n].clone()
+        by_target, by_lens = jacobian(solve, target, lens)
+        # Newton stops within 1e-13 of the root; J there differs from J at the root by as much.
+        torch.testing.assert_close(by_target, inverse[n], rtol=0, atol=1e-11)
+        torch.testing.assert_close(by_lens, -inverse[n] @ by_coefficients[n], rtol=0, atol=1e-11)
+
+
+def jacobian(function: Callable[[Tensor, Tensor], Tensor], *inputs: Tensor) -> tuple[Tensor, Tensor]:
+    by_target, by_lens = torch.autograd.functional.jacobian(function, inputs)
+    return by_target, by_lens
 
 
 def test_invalid_pixels_leave_no_nan_in_gradients() -> None:

@@ -307,8 +307,11 @@ class Results:
             focal=focal,
             sigma_focal=None if math.isnan(sigma_focal) else sigma_focal,
             rms=camera.calibration.rms,
+            fx=camera.intrinsics.fx,
+            fy=camera.intrinsics.fy,
+            cx=camera.intrinsics.cx,
+            cy=camera.intrinsics.cy,
             sigma_fx=(camera.standard_deviations or {}).get("fx"),
-            **camera.intrinsics.model_dump(exclude={"skew"}),
         )
 
     def _path(self, key: str) -> Path:

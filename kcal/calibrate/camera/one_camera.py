@@ -58,7 +58,7 @@ _PROMISED = 0.7
 _BEHIND = 0.8
 # Widths of the prior of the difference between two groups: ln scale, and shares of the image's diagonal.
 _APART, _APART_CENTER = 0.1, 0.02
-# Nats that two groups may still lack after a round of refits: further rounds gave 5 and less.
+# Two groups that lack more nats after a round of refits are given up: further rounds gained 6 at most.
 _HOPELESS = 15.0
 # Rounds of refits; share of θ, and standard deviations of the camera, by which the last one changes it; the largest
 # share of a step of groups that the next one is taken to be; and steps of the search for groups.
@@ -249,8 +249,8 @@ def own_lenses(
         options: with which they were fitted.
         progress: called after each further fit.
         theta: (V, 3) roughly what will be found, or None.
-        briefly: of a lens that moves, only by how much: not whether two cameras are likelier, and the error bars of
-            a single camera.
+        briefly: end as soon as it is sure that the lens moves: error bars are then those of a lens that does not, and
+            two cameras are not tried.
     """
     views = _of_fit(fit, pixels, torch.zeros_like(pixels[:, 0, :1]).expand(-1, SIZE))
     if not bool(views.N.isfinite().all() and views.g.isfinite().all()):
@@ -285,9 +285,9 @@ def own_lenses(
         found = _likeliest(about, _LENS)
         nats = found.nats + refits.nats(about)
         second = _grouped(about, found.mean, fit.size)
-        if nats >= _SURE and briefly:
-            return OwnLenses(fit=refits.fit, sigma=found.sigma[:SIZE], theta=refits.theta, nats=nats)
         if nats >= _SURE:
+            if briefly:
+                return OwnLenses(fit=refits.fit, sigma=found.sigma[:SIZE], theta=refits.theta, nats=nats)
             # About the likeliest ones, no more than these are thinkable.
             sigma = about.later(8.0 * found.sigma[:SIZE])
             normal = OwnLenses(fit=refits.widened(sigma), sigma=sigma, theta=refits.theta, nats=nats)
@@ -400,8 +400,7 @@ def _two_cameras(refits: _Refits, views: ByView, second: Tensor, nats: float) ->
     if likelier < nats + WORTH:
         return None
     if 2 * int(second.sum()) > len(second):
-        second = ~second
-        both, covariance, _ = _parted(views, second, refits.fit.size)
+        second, both = ~second, both.flip(0)
     fit, change = refits.fit, both[1] - both[0]
     by_group = views.by_group(second)
     groups = TwoCameras(

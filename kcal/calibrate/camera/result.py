@@ -357,11 +357,16 @@ class CameraCalibrationResult(ArrowRows):
     def among(self, views: Sequence[int], observations: Observations) -> CameraCalibrationResult:
         """This result of some views as one of all `observations`: NaN for the others."""
         count = len(observations.views)
-        names = ("per_view_rms", "residuals", "cam_from_board_rotation", "cam_from_board_translation", "by_view")
-        parts = {name: part for name in names if (part := getattr(self, name)) is not None}
-        wider: dict[str, Any] = {name: among(part, views, count) for name, part in parts.items()}
-        hybrid = None if self.hybrid is None else self.hybrid.among(views, count)
-        return dataclasses.replace(self, observations=observations, hybrid=hybrid, **wider)
+        return dataclasses.replace(
+            self,
+            observations=observations,
+            per_view_rms=among(self.per_view_rms, views, count),
+            residuals=among(self.residuals, views, count),
+            cam_from_board_rotation=among(self.cam_from_board_rotation, views, count),
+            cam_from_board_translation=among(self.cam_from_board_translation, views, count),
+            hybrid=None if self.hybrid is None else self.hybrid.among(views, count),
+            by_view=None if self.by_view is None else among(self.by_view, views, count),
+        )
 
     def _record(self) -> CalibrationRecord:
         board, warp = self.observations.board, self.board_warp
