@@ -41,8 +41,17 @@ def show_command(file: Annotated[Path, inputs.SHOWN]) -> None:
     `kcal show left.camera.json`
 
     Args:
-        file: Camera, rig or observations of kcal, or a foreign camera file.
+        file: Camera, rig or observations of kcal, or a foreign camera file; rig.json:left is one camera.
     """
+    path, name = inputs.named_source(str(file))
+    if name is not None:
+        rig = kcal.load_rig(path) if file_kind(path) == "rig" else None
+        if rig is not None and rig.is_pair and name in rig.names:
+            camera = shown.derived_rig(rig)[0][rig.names.index(name)]
+        else:
+            camera = shown.derived_camera(inputs.single_camera(file))
+        _print(shown.camera_blocks(*camera))
+        return
     if file_kind(file) not in ("camera", "rig", "observations"):
         _show_foreign(file)
         return

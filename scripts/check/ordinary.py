@@ -7,12 +7,14 @@ camera is then fitted to every other view of a capture (in natural order of thei
 ways. Held out: RMS in pixels over both halves, `scripts.shared.held_out`: as seen, with poses and board refitted, and
 with each view's own motion during the readout refitted as well. *Lost* are seen corners that a camera has no image of;
 they are not in its RMS. Halves: `camera_difference` between both halves' cameras; a ratio of 1 is what their error bars
-state, p is the chance of more. A model that was not measured has no column.
+state, p is the chance of more. A model that was not measured has no column. `parts`: the same between a few
+views, drawn at random, and the rest.
 """
 
 from __future__ import annotations
 
 import math
+import random
 import statistics
 import subprocess
 import time
@@ -27,7 +29,7 @@ from kcal.lens import camera_difference
 from kcal.report import camera_verdict
 from scripts.shared.children import interpreter
 from scripts.shared.held_out import Projection, of_halves
-from scripts.shared.page import table
+from scripts.shared.page import Lines, table
 from scripts.shared.peer_lenses import END, fisheye, opencv, splined_camera
 from scripts.shared.real_captures import RealCapture, load, names
 from scripts.shared.sections import NOT_KEPT, Kept, Record, section
@@ -158,3 +160,43 @@ def real(kept: Kept = NOT_KEPT, captures: tuple[str, ...] = ("all",)) -> list[st
     wanted = names() if captures == ("all",) else list(captures)
     records = kept.records([(name,) for name in wanted], judged, lambda one: str(one["held"].get("kcal")))
     return lines(sorted((r for r in records if r["key"][0] in wanted), key=lambda r: wanted.index(r["key"][0])))
+
+
+def _part(name: str, count: int, seed: int) -> Record:
+    """A camera of so many views of a capture, drawn at random, against that of its other views."""
+    seen = load(name).seen
+    drawn = random.Random(f"{name} {count} {seed}").sample(seen.names, count)
+    cameras: list[Camera] = []
+    for views in (drawn, [view for view in seen.names if view not in drawn]):
+        try:
+            result = calibrate_camera(seen.subset(views))
+        except KcalError as error:
+            return {"refused": "rest" if cameras else "part", "why": str(error)}
+        cameras.append(result.camera)
+    between = camera_difference(*cameras)
+    stops = any(one.severity == "stop" for one in result.findings)
+    return {"ratio": between.ratio, "p": between.probability, "stops": stops}
+
+
+@section("ordinary.md", "parts", captures=("st1_l",), views=(4,), seeds=range(1))
+def parts(
+    kept: Kept = NOT_KEPT,
+    captures: tuple[str, ...] = ("all",),
+    views: tuple[int, ...] = (4, 6, 8, 12),
+    seeds: range = range(2),
+) -> Lines:
+    """Names of captures, and how many of their views are drawn."""
+    sizes = {name: len(load(name).seen.views) for name in (names() if captures == ("all",) else captures)}
+    keys = [
+        (name, count, seed) for name, size in sizes.items() for count in views for seed in seeds if 2 * count <= size
+    ]
+    records = kept.records(keys, _part)
+    yield ["views", "parts", "refused", "the rest refused", "p < 5 %", "p < 1 %", "median ratio", "largest"]
+    for count in views:
+        ours = [record for record in records if record["key"][1] == count]
+        known = sorted((record for record in ours if "ratio" in record), key=lambda record: record["ratio"])
+        refused = [sum(record.get("refused") == which for record in ours) for which in ("part", "rest")]
+        beyond = [sum(record["p"] < level for record in known) for level in (0.05, 0.01)]
+        middle = statistics.median(record["ratio"] for record in known)
+        worst = f"{known[-1]['ratio']:.2f} (`{known[-1]['key'][0]}`)"
+        yield list(map(str, [count, len(ours), *refused, *beyond, f"{middle:.2f}", worst]))

@@ -74,7 +74,11 @@ def test_rigs(tmp_path: Path, camera: Path) -> None:
     text = run("import", tmp_path / "ros_left.yaml", tmp_path / "ros_right.yaml", "-o", tmp_path / "back.json")
     assert "baseline 1.5 m" in text
     assert load_rig(tmp_path / "back.json").right_from_left_translation.tolist() == pytest.approx([-1.5, 0, 0])
-    assert "baseline 1.5 m" in run("show", tmp_path / "rig.json")
+    whole = run("show", tmp_path / "rig.json")
+    assert "baseline 1.5 m" in whole
+    left, right = (run("show", f"{tmp_path / 'rig.json'}:{name}") for name in ("left", "right"))
+    assert left + right in whole
+    assert "camera right" not in left
     run("export", f"{tmp_path / 'rig.json'}:left", "-o", tmp_path / "left.txt")
     with pytest.raises(InputError, match=r"2 cameras; name one of .left., .right., for example \S*rig.json:left$"):
         run("diff", tmp_path / "rig.json", camera)

@@ -42,6 +42,7 @@ from kcal.calibrate.camera.warnings import (
     general_findings,
     hybrid_findings,
     motion_findings,
+    moves_beyond_hands,
     outlier_findings,
     pixel_findings,
     pupil_findings,
@@ -219,13 +220,13 @@ def calibrate_what_fits(
 
     Raises:
         DegenerateError: as `calibrate_hybrid`, with the names of the views.
-        InputError: more than a fifth of the views do not fit; the message names them.
+        InputError: more than a fifth of the views do not fit, or the only one of four; the message names them.
     """
     # What these refuse, leaving out views does not mend.
     check_views(observations.board.points, observations.pixels(), observations.names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
     given = options.start_focal(observations.image_size)
     try:
-        return _with_start(calibrate_hybrid(observations, options, progress), given)
+        result = _with_start(calibrate_hybrid(observations, options, progress), given)
     except _FAILED as error:
         if options.reject is not None:
             raise
@@ -239,6 +240,8 @@ def calibrate_what_fits(
         if any(name in str(error) for name in observations.names):
             raise
         raise DegenerateError(f"{error}; the views are {_few_names(observations.names)}") from error
+    else:
+        return result if options.reject is not None else _of_hands(result, observations, options, progress)
     if given is not None:
         progress("again without the focal length that was given")
         less = dataclasses.replace(options, focal=None, field_of_view=None)
@@ -264,14 +267,37 @@ def calibrate_what_fits(
 
 def few_views(wrong: int, count: int) -> bool:
     """Whether so many of `count` views are few enough to go on without them."""
-    return wrong <= max(1.0, _FEW * count) and count - wrong >= MINIMUM_VIEWS
+    # Three fit one another whatever is wrong with one of them.
+    return wrong <= max(1.0, _FEW * count) and count - wrong > MINIMUM_VIEWS
+
+
+def _of_hands(
+    result: CameraCalibrationResult, observations: Observations, options: CalibrationOptions, progress: Progress
+) -> CameraCalibrationResult:
+    """A result whose views moved as hands do; without those that no lens fits where they moved by more.
+
+    A motion at its limit makes room in all views for what is wrong with a few: of seven views of a webcam, two of them
+    wrong, the focal length then was 844 ± 20 px in place of 1130.
+    """
+    if result.hybrid is None or not moves_beyond_hands(result.hybrid):
+        return result
+    wrong = _wrong_views(observations, options, motion=False, bending=False)
+    if not wrong:
+        return result
+    if few_views(len(wrong), len(observations.views)):
+        return _without(observations, options, wrong, None, progress)
+    raise InputError(
+        f"{len(wrong)} of {len(observations.views)} views do not fit the others, unless all moved by more than any "
+        f"hand does while they were read: {listed_views(observations, wrong)}. Look at these images, remove what is "
+        "blurred or moving, and detect again"
+    )
 
 
 def _without(
     observations: Observations,
     options: CalibrationOptions,
     wrong: Mapping[int, str],
-    failure: Exception,
+    failure: Exception | None,
     progress: Progress,
 ) -> CameraCalibrationResult:
     """Without views that do not fit."""
@@ -301,11 +327,11 @@ def _without_given(result: CameraCalibrationResult, given: float, why: str) -> C
     return dataclasses.replace(result, findings=(note, *result.findings))
 
 
-def _wrong_views(observations: Observations, options: CalibrationOptions) -> dict[int, str]:
+def _wrong_views(observations: Observations, options: CalibrationOptions, **how: Any) -> dict[int, str]:
     """Views that do not fit, by a fit in which few wrong corners count little: index -> why."""
     pixels, board = observations.pixels(), observations.board.points
     try:
-        own = FitOptions(board=options.board, robust=True)
+        own = FitOptions(board=options.board, robust=True, **how)
         fit = fit_hybrid(board, pixels, observations.image_size, options=own)
     except (*_FAILED, DegenerateError):
         return {}

@@ -14,7 +14,7 @@ from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.calibrate.hybrid.fit import HybridFit, pixels_are_square
 from kcal.calibrate.problem.parameters import GaussianPrior, Term
 from kcal.calibrate.problem.state import FELT, FEW, LARGEST, BoardState
-from kcal.errors import InputError
+from kcal.errors import DegenerateError, InputError
 from kcal.finding import Finding
 from kcal.lens.camera import Camera
 from kcal.lens.projection import pupil_depth
@@ -30,16 +30,21 @@ _BENT, _SOME, _NAMED = 2.0, 0.5, 5
 _LIMIT = 0.9
 
 
+def moves_beyond_hands(fit: HybridFit) -> bool:
+    """Whether the motion of views is at its limit: it then stands for something else."""
+    return fit.motion_sigma is not None and max(fit.motion_sigma) > _LIMIT * LARGEST
+
+
 def motion_findings(fit: HybridFit) -> list[Finding]:
     """A doubt where the camera or the board moved while an image was read, with how much that moved corners."""
     if fit.motion_sigma is None or fit.readout is None:
         return []
-    if max(fit.motion_sigma) > _LIMIT * LARGEST:
+    if moves_beyond_hands(fit):
         text = (
             "while an image is read, views move by more than any hand does: these motions stand for something else "
-            "(wrong corners, a cropped or stabilized video)"
+            "(wrong corners, a board that bends, a cropped or stabilized video), and error bars may be far too small"
         )
-        return [Finding("motion", "doubt", text, "look at the views that fit worst, and photograph a board on a stand")]
+        return [Finding("motion", "stop", text, "look at the views that fit worst, and photograph a board on a stand")]
     lines = "column" if fit.readout.columns else "row"
     moved = fit.motion_sigma.moved(float(fit.state.parameters[0]), fit.readout.reach(fit.board_points))
     if moved < FELT * fit.sigma:
@@ -405,6 +410,11 @@ def general_findings(
         doubt("open", f"the views do not determine {', '.join(lost)}", "choose a smaller model or add views")
     if not bool(camera.covers_image()):
         _, valid = camera.unproject(camera.grid(33, 25))
+        if not bool(valid.any()):
+            raise DegenerateError(
+                "no pixel of the image has a ray: the lens that shows the corners folds on its axis, where no board "
+                "was; add views with the board in the middle of the image, or all around it"
+            )
         share = percent_text(float((~valid).double().mean()))
         if hybrid:
             doubt(

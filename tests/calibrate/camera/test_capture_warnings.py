@@ -12,13 +12,22 @@ from calibrate_scenes import observe
 
 from kcal import Board, Camera, InputError, Observations, View
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.camera.warnings import check_end, measured_aspect, motion_findings, pixel_findings
+from kcal.calibrate.camera.warnings import (
+    check_end,
+    general_findings,
+    measured_aspect,
+    motion_findings,
+    pixel_findings,
+)
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
+from kcal.calibrate.problem.state import LARGEST
+from kcal.errors import DegenerateError
 from kcal.finding import sentences
 from kcal.lens import rotation_from_vector
 from kcal.lens.uncertainty import paraxial_focal
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.captures import BoardSize, board_points, sample_board_poses
+from kcal.solve.lm import SolverStatus
 from scripts.shared.moving_captures import Hands, moving_capture
 
 BOARD = BoardSize(9, 6, 0.05)
@@ -37,9 +46,13 @@ def fitted(views: int, hands: Hands | None) -> HybridFit:
 
 @pytest.mark.slow
 def test_motion_is_told_in_pixels() -> None:
-    many = sentences(motion_findings(fitted(12, HANDS)))
+    fit = fitted(12, HANDS)
+    many = sentences(motion_findings(fit))
     assert len(many) == 1
     assert "moved while rows were read" in many[0]
+    assert fit.motion_sigma is not None
+    at_limit = fit.log_ratio + math.log(LARGEST / max(fit.motion_sigma))
+    assert [one.severity for one in motion_findings(dataclasses.replace(fit, log_ratio=at_limit))] == ["stop"]
     assert motion_findings(fitted(12, None)) == []
 
 
@@ -49,6 +62,12 @@ def test_few_views_that_moved() -> None:
     for hands in (HANDS, None):
         few = sentences(motion_findings(fitted(5, hands)))
         assert [text.startswith("5 views hardly tell whether") for text in few] == [True]
+
+
+def test_a_camera_without_rays() -> None:
+    folded = Camera.build(focal=(800, 800), center=(321, 240), size=(640, 480), coefficients=[-1e9])
+    with pytest.raises(DegenerateError, match="no pixel of the image has a ray"):
+        general_findings(["a"], folded, 0.1, torch.tensor([0.1]), (), SolverStatus.CONVERGED)
 
 
 def unequal(factor: float, board: Board, roll: float = math.pi, aspect: float = 1.0) -> Observations:
