@@ -225,8 +225,11 @@ def calibrate_what_fits(
     # What these refuse, leaving out views does not mend.
     check_views(observations.board.points, observations.pixels(), observations.names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
     given = options.start_focal(observations.image_size)
+    failure: Exception | None = None
     try:
         result = _with_start(calibrate_hybrid(observations, options, progress), given)
+        if options.reject is not None or not moves_beyond_hands(result.hybrid):
+            return result
     except _FAILED as error:
         if options.reject is not None:
             raise
@@ -240,9 +243,7 @@ def calibrate_what_fits(
         if any(name in str(error) for name in observations.names):
             raise
         raise DegenerateError(f"{error}; the views are {_few_names(observations.names)}") from error
-    else:
-        return result if options.reject is not None else _of_hands(result, observations, options, progress)
-    if given is not None:
+    if failure is not None and given is not None:
         progress("again without the focal length that was given")
         less = dataclasses.replace(options, focal=None, field_of_view=None)
         try:
@@ -250,7 +251,11 @@ def calibrate_what_fits(
         except InputError:
             raise failure from None
         return _without_given(result, given, "belongs to no lens that shows the corners")
-    wrong = _wrong_views(observations, options)
+    # Motion at its limit makes room in all views for what is wrong with a few: of seven views of a webcam, two of them
+    # of a board that bent, the focal length then was 844 ± 20 px in place of 1130. A lens that stands still tells them.
+    wrong = _wrong_views(observations, options, **({} if failure else {"motion": False, "bending": False}))
+    if failure is None and not wrong:
+        return result
     listed = listed_views(observations, wrong)
     if not wrong or not few_views(len(wrong), len(observations.views)):
         which = (
@@ -258,9 +263,10 @@ def calibrate_what_fits(
             if wrong
             else f"Look first at {least_planar(observations.board.points, observations.pixels(), observations.names)}"
         )
+        what = "no lens shows all corners where they are" if failure else "views move by more than any hand does"
         raise InputError(
-            f"no lens shows all corners where they are. {which}. Do all images show this board, not mirrored, and are "
-            "all from this camera at this zoom? Remove those that do not, and detect again"
+            f"{what}. {which}. Do all images show this board, not mirrored, and are all from this camera at this "
+            "zoom? Remove those that do not, and detect again"
         ) from failure
     return _without(observations, options, wrong, failure, progress)
 
@@ -269,28 +275,6 @@ def few_views(wrong: int, count: int) -> bool:
     """Whether so many of `count` views are few enough to go on without them."""
     # Three fit one another whatever is wrong with one of them.
     return wrong <= max(1.0, _FEW * count) and count - wrong > MINIMUM_VIEWS
-
-
-def _of_hands(
-    result: CameraCalibrationResult, observations: Observations, options: CalibrationOptions, progress: Progress
-) -> CameraCalibrationResult:
-    """A result whose views moved as hands do; without those that no lens fits where they moved by more.
-
-    A motion at its limit makes room in all views for what is wrong with a few: of seven views of a webcam, two of them
-    wrong, the focal length then was 844 ± 20 px in place of 1130.
-    """
-    if result.hybrid is None or not moves_beyond_hands(result.hybrid):
-        return result
-    wrong = _wrong_views(observations, options, motion=False, bending=False)
-    if not wrong:
-        return result
-    if few_views(len(wrong), len(observations.views)):
-        return _without(observations, options, wrong, None, progress)
-    raise InputError(
-        f"{len(wrong)} of {len(observations.views)} views do not fit the others, unless all moved by more than any "
-        f"hand does while they were read: {listed_views(observations, wrong)}. Look at these images, remove what is "
-        "blurred or moving, and detect again"
-    )
 
 
 def _without(

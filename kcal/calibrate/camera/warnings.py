@@ -30,9 +30,9 @@ _BENT, _SOME, _NAMED = 2.0, 0.5, 5
 _LIMIT = 0.9
 
 
-def moves_beyond_hands(fit: HybridFit) -> bool:
+def moves_beyond_hands(fit: HybridFit | None) -> bool:
     """Whether the motion of views is at its limit: it then stands for something else."""
-    return fit.motion_sigma is not None and max(fit.motion_sigma) > _LIMIT * LARGEST
+    return fit is not None and fit.motion_sigma is not None and max(fit.motion_sigma) > _LIMIT * LARGEST
 
 
 def motion_findings(fit: HybridFit) -> list[Finding]:
