@@ -220,7 +220,8 @@ def calibrate_what_fits(
 
     Raises:
         DegenerateError: as `calibrate_hybrid`, with the names of the views.
-        InputError: more than a fifth of the views do not fit, or the only one of four; the message names them.
+        InputError: more than a fifth of the views do not fit, or the only one of four; the message names them. Or no
+            hand moves as views do while they are read.
     """
     # What these refuse, leaving out views does not mend.
     check_views(observations.board.points, observations.pixels(), observations.names, _UNKNOWNS, fewest=MINIMUM_VIEWS)
@@ -228,7 +229,7 @@ def calibrate_what_fits(
     failure: Exception | None = None
     try:
         result = _with_start(calibrate_hybrid(observations, options, progress), given)
-        if options.reject is not None or not moves_beyond_hands(result.hybrid):
+        if not moves_beyond_hands(result.hybrid):
             return result
     except _FAILED as error:
         if options.reject is not None:
@@ -254,8 +255,6 @@ def calibrate_what_fits(
     # Motion at its limit makes room in all views for what is wrong with a few: of seven views of a webcam, two of them
     # of a board that bent, the focal length then was 844 ± 20 px in place of 1130. A lens that stands still tells them.
     wrong = _wrong_views(observations, options, **({} if failure else {"motion": False, "bending": False}))
-    if failure is None and not wrong:
-        return result
     listed = listed_views(observations, wrong)
     if not wrong or not few_views(len(wrong), len(observations.views)):
         which = (
@@ -263,10 +262,14 @@ def calibrate_what_fits(
             if wrong
             else f"Look first at {least_planar(observations.board.points, observations.pixels(), observations.names)}"
         )
-        what = "no lens shows all corners where they are" if failure else "views move by more than any hand does"
+        what = "no lens shows all corners where they are"
+        cure = "Do all images show this board, not mirrored, and are all from this camera at this zoom?"
+        if failure is None:
+            what = "views move by more than any hand does while they are read, so that no error bar would hold"
+            cure = "Are corners wrong, does the board bend, or was the video cropped or stabilized?"
         raise InputError(
-            f"{what}. {which}. Do all images show this board, not mirrored, and are all from this camera at this "
-            "zoom? Remove those that do not, and detect again"
+            f"{what}. {which}. {cure} Remove those that do not fit, or photograph a stiff board on a stand, and detect "
+            "again"
         ) from failure
     return _without(observations, options, wrong, failure, progress)
 

@@ -28,23 +28,23 @@ from kcal.texts import percent_text
 _BENT, _SOME, _NAMED = 2.0, 0.5, 5
 # A share of the largest motion, from which it is at its limit.
 _LIMIT = 0.9
+# Meters: of a smaller distance a hand moves by that share.
+_NEAR = 0.2
 
 
 def moves_beyond_hands(fit: HybridFit | None) -> bool:
-    """Whether the motion of views is at its limit: it then stands for something else."""
-    return fit is not None and fit.motion_sigma is not None and max(fit.motion_sigma) > _LIMIT * LARGEST
+    """Whether the motion of views is at its limit: it then stands for something else, unless the board is near."""
+    if fit is None or fit.readout is None or fit.motion_sigma is None:
+        return False
+    turn, shift, turn_twice, shift_twice = fit.motion_sigma
+    shifts = (shift, shift_twice) if fit.readout.distance > _NEAR else ()
+    return max(turn, turn_twice, *shifts) > _LIMIT * LARGEST
 
 
 def motion_findings(fit: HybridFit) -> list[Finding]:
     """A doubt where the camera or the board moved while an image was read, with how much that moved corners."""
     if fit.motion_sigma is None or fit.readout is None:
         return []
-    if moves_beyond_hands(fit):
-        text = (
-            "while an image is read, views move by more than any hand does: these motions stand for something else "
-            "(wrong corners, a board that bends, a cropped or stabilized video), and error bars may be far too small"
-        )
-        return [Finding("motion", "stop", text, "look at the views that fit worst, and photograph a board on a stand")]
     lines = "column" if fit.readout.columns else "row"
     moved = fit.motion_sigma.moved(float(fit.state.parameters[0]), fit.readout.reach(fit.board_points))
     if moved < FELT * fit.sigma:

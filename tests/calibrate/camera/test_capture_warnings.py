@@ -6,6 +6,7 @@ import dataclasses
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from calibrate_scenes import observe
@@ -17,6 +18,7 @@ from kcal.calibrate.camera.warnings import (
     general_findings,
     measured_aspect,
     motion_findings,
+    moves_beyond_hands,
     pixel_findings,
 )
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
@@ -51,8 +53,11 @@ def test_motion_is_told_in_pixels() -> None:
     assert len(many) == 1
     assert "moved while rows were read" in many[0]
     assert fit.motion_sigma is not None
-    at_limit = fit.log_ratio + math.log(LARGEST / max(fit.motion_sigma))
-    assert [one.severity for one in motion_findings(dataclasses.replace(fit, log_ratio=at_limit))] == ["stop"]
+    assert fit.readout is not None
+    log_ratio = fit.log_ratio + math.log(LARGEST / fit.motion_sigma.shift)
+    at_limit = dataclasses.replace(fit, log_ratio=np.where(np.arange(4) == 1, log_ratio, fit.log_ratio))
+    near = dataclasses.replace(at_limit, readout=dataclasses.replace(fit.readout, distance=0.1))
+    assert [moves_beyond_hands(one) for one in (fit, at_limit, near)] == [False, True, False]
     assert motion_findings(fitted(12, None)) == []
 
 
