@@ -6,6 +6,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -14,7 +15,7 @@ import typer
 import kcal
 from kcal.cli import kinds, rooms
 from kcal.cli.console import err, out, print_answer, print_styled, print_wrote, steps, tell, tell_table, warn
-from kcal.cli.inputs import CAMERA_OR_RIG, pixel_sigma_and_source, pixel_sigma_of, single_camera
+from kcal.cli.inputs import CALIBRATED_OR_RIG, CAMERA_OR_RIG, pixel_sigma_and_source, pixel_sigma_of, single_camera
 from kcal.cli.options import Kind, Several
 from kcal.cli.rig_sources import cameras_of_files, check_views_of
 from kcal.errors import FileError, InputError
@@ -225,7 +226,7 @@ _OFTEN = 5.0
 
 
 def check_command(
-    camera: kinds.CalibratedOrRig,
+    camera: Annotated[Path, CALIBRATED_OR_RIG],
     *,
     ranges: kinds.Table | None = None,
     marks: kinds.Marks | None = None,
@@ -372,17 +373,14 @@ def _all_refits(
         out.print(f"{len(done)} refits are done already ({path})", markup=False)
     todo = sorted({*range(count)} - {refit.seed for refit in done})
     saved = time.monotonic()
-    try:
-        with steps("refits", count) as advance:
-            advance("", len(done))
-            for refit in rooms.simulated_refits(result, options, ranges, todo):
-                done.append(refit)
-                advance(f"{len(done)} of {count}")
-                if time.monotonic() - saved > _OFTEN:
-                    _keep_refits(path, key, done)
-                    saved = time.monotonic()
-    except KeyboardInterrupt:
-        pass
+    with suppress(KeyboardInterrupt), steps("refits", count) as advance:
+        advance("", len(done))
+        for refit in rooms.simulated_refits(result, options, ranges, todo):
+            done.append(refit)
+            advance(f"{len(done)} of {count}")
+            if time.monotonic() - saved > _OFTEN:
+                _keep_refits(path, key, done)
+                saved = time.monotonic()
     if todo and done:
         _keep_refits(path, key, done)
     return done, len(done) == count

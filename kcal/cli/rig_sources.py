@@ -188,10 +188,7 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     warn(*(f"{text}; left out" for text in refused))
     features, counts = rooms.scene_of((first, second), pairs, found)
     rows: list[tuple[str, ...]] = [("scene", "matched", "no texture", "off the line", "moved", "thinned", "used")]
-    rows += [
-        (one.name, *map(str, (one.matched, one.untextured, one.off_line, one.moved, one.thinned, one.used)))
-        for one in counts
-    ]
+    rows += [tuple(map(str, dataclasses.astuple(one))) for one in counts]
     read.notes += aligned(rows)
     if alone := sum(len(rooms.expand_images(one)) for one in given) - 2 * len(chosen):
         read.notes.append(f"{counted_text(alone, 'image')} of the scene without partner")

@@ -253,7 +253,6 @@ def stars_command(
     angles = ["heading", "pitch", "roll", "± east", "± north", "± up"]
     if not views[0].on_earth:
         angles = ["right ascension", "declination", "± x", "± y", "± z"]
-    rows = [["image", "stars", "named", "RMS px", *angles, "left out"]]
     with steps("naming stars", len(files)) as advance:
         for path, view in zip(files, views, strict=True):
             try:
@@ -269,16 +268,15 @@ def stars_command(
                     _draw(picture, image, found, catalog, path.name)
                 told.append(_told(path, found))
                 seen.append((told[-1], found))
-                rows.append(_row(told[-1], found))
                 warn(*(f"{path.name}: {text}" for text in found.warnings))
             advance(path.name)
     for number, text in rooms.clock_doubts([found for _, found in seen]):
         warn(f"{seen[number][0]['image']}: {text}")
         seen[number][0]["warnings"].append(text)
     tell(images=told)
-    if len(rows) == 1:
+    if not seen:
         raise InputError(f"in none of {len(files)} images stars have names")
-    print_table(rows)
+    print_table([["image", "stars", "named", "RMS px", *angles, "left out"], *(_row(*one) for one in seen)])
     if views[0].on_earth and night.dut1 is None:
         out.print("UT1 - UTC is not known (--dut1): it is part of the σ about the Earth's axis with 8″")
     print_wrote(picture)

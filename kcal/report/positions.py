@@ -464,11 +464,9 @@ def siting_figure(
         colored, panels[-1], "standard deviation of a position on the map", ticks=levels, format=lengths
     )
     patches = [Patch(color=_SINGLE, label="one site sees it: a bearing only"), Patch(color=_HIDDEN, label="hidden")]
-    marks = [axes.plot([], [], "^", color="white", markeredgecolor="black", markersize=9, label="site")[0]]
+    marks = axes.plot([], [], "^", color="white", markeredgecolor="black", markersize=9, label="site")
     if ranked:
-        marks.append(
-            axes.plot([], [], "o", color=_NEW, markeredgecolor="black", label="candidate, by rank; new site")[0]
-        )
+        marks += axes.plot([], [], "o", color=_NEW, markeredgecolor="black", label="candidate, by rank; new site")
     figure.legend(handles=[*patches, *marks], loc="outside upper left", ncols=4, frameon=False, fontsize=9)
     return figure
 
