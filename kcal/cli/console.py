@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.markup import escape
@@ -23,6 +23,8 @@ from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import replaced, write_atomic
 from kcal.table import Table
 from kcal.texts import one_line, visible
+
+_T = TypeVar("_T")
 
 # Printing for all commands: output, warnings, tables, JSON for programs, and progress bars for long work.
 
@@ -271,6 +273,14 @@ def steps(description: str, total: int | None) -> Iterator[Callable[..., None]]:
         for other in before:
             _line.update(other, visible=True)
         gc.unfreeze()
+
+
+def followed(description: str, items: Collection[_T], name: Callable[[_T], str]) -> Iterator[_T]:
+    """The items one after the other, with a bar (`steps`) that is told the name of each when it is done."""
+    with steps(description, len(items)) as advance:
+        for item in items:
+            yield item
+            advance(name(item))
 
 
 # Commands that can be pasted, at the end of refusals.

@@ -14,7 +14,7 @@ import typer
 
 import kcal
 from kcal.cli import kinds, rooms
-from kcal.cli.console import err, out, print_answer, print_styled, print_wrote, steps, tell, tell_table, warn
+from kcal.cli.console import err, followed, out, print_answer, print_styled, print_wrote, steps, tell, tell_table, warn
 from kcal.cli.inputs import CALIBRATED_OR_RIG, CAMERA_OR_RIG, pixel_sigma_and_source, pixel_sigma_of, single_camera
 from kcal.cli.options import Kind, Several
 from kcal.cli.rig_sources import cameras_of_files, check_views_of
@@ -175,11 +175,9 @@ def judged_rig(
     Of a rig that was just solved, `result` has its warnings, its pairs of boards, and what is drawn of it.
     """
     found = []
-    with steps("cameras", len(observations)) as advance:
-        for (side, camera), file in zip(cameras, observations, strict=False):
-            again, made = calibrated_again(camera, file, f"calibrating {side}")
-            found.append(judged(again, made, (), mark_sigma=mark_sigma, name=side, stored=camera))
-            advance("")
+    for file, (side, camera) in zip(followed("cameras", observations, lambda _: ""), cameras, strict=False):
+        again, made = calibrated_again(camera, file, f"calibrating {side}")
+        found.append(judged(again, made, (), mark_sigma=mark_sigma, name=side, stored=camera))
     pairs, unpaired = None, ""
     # Views of a rig that was solved without pairs may be of different moments, though their images are named alike.
     solved_apart = rig.calibration is not None and not rig.calibration.pairs
