@@ -335,16 +335,13 @@ def _first_view(size: tuple[int, int], board: Board, number: int) -> NextView:
 
 
 def _seen_pixels(pixels: Tensor | None) -> list[list[float]]:
-    if pixels is None:
-        return []
-    return [[u, v] for u, v in pixels.tolist() if math.isfinite(u) and math.isfinite(v)]
+    return [] if pixels is None else pixels[pixels.isfinite().all(-1)].tolist()
 
 
 def _holds(rotation: Tensor) -> list[list[float]]:
     """Of each view: where the board's normal leans (x, y), as the sine of its tilt, and its roll in degrees."""
     rotation = rotation[rotation.isfinite().all(-1).all(-1)]
-    leaning: list[list[float]] = torch.cat([rotation[:, :2, 2], board_rolls(rotation)[:, None]], 1).tolist()
-    return leaning
+    return torch.cat([rotation[:, :2, 2], board_rolls(rotation)[:, None]], 1).tolist()
 
 
 # The capture page's routes.

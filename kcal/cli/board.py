@@ -92,8 +92,7 @@ def board_measure_command(
     kcal.calibrate.save_measured_board(board, output)
     console.draw_picture(picture, lambda: rooms.board_figure(board))
     out.print(f"{board.board}, {len(board.observations)} of {len(sets)} observations: {', '.join(board.observations)}")
-    for line in rooms.board_text(board):
-        out.print(f"  {line}")
+    out.print("\n".join(f"  {line}" for line in rooms.board_text(board)))
     out.print(f"evidence against the board as ordered: {board.log_evidence:.0f} nats")
     for name, camera in zip(names, found.cameras, strict=True):
         if turned := int((camera.turns > 0).sum()):

@@ -380,10 +380,9 @@ def batch_command(
         kcal.lens.LensModel.named(model)
     with steps("looking at the images", None):
         jobs = rooms.read_jobs(cameras, given, model, square)
-    if given is None:
-        for job in jobs:
-            if job.board is not None:
-                out.print(f"{job.name}: board {job.board}")
+    for job in jobs:
+        if given is None and job.board is not None:
+            out.print(f"{job.name}: board {job.board}")
     options = rooms.BatchOptions(refine=refine, board_warp=board_warp, one_type=one_type, time_limit=time_limit)
     try:
         with steps("images and cameras", rooms.pieces(jobs)) as advance:

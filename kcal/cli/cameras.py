@@ -101,8 +101,8 @@ def import_command(
     format: kinds.Name | None = None,
     size: kinds.Size | None = None,
     fisheye: bool | None = None,
-    board: kinds.Inner | None = None,
-    square: Annotated[kinds.Side, Kind(of="board")] | None = None,
+    board: Annotated[str, Kind(metavar="CxR")] | None = None,
+    square: Annotated[str, Kind(metavar="LENGTH", of="board")] | None = None,
     survey_sigma: kinds.Sigma | None = None,
     geoid: kinds.Meters | None = None,
     unit: kinds.Unit | None = None,
@@ -308,8 +308,7 @@ def diff_command(
     )
     if then is not None and now is not None and now != then:
         out.print(f"{abs(now - then):g} °C {'warmer' if now > then else 'colder'}")
-    for line in rooms.difference_text(found):
-        out.print(line)
+    out.print("\n".join(rooms.difference_text(found)))
     if picture is not None:
         print_wrote(kcal.report.save_picture(picture, rooms.difference_figure(found, title=f"{first} and {second}")))
 
@@ -403,13 +402,8 @@ def bake_command(
     with steps("baking", None):
         lookup = kcal.lens.bake(single_camera(camera), tolerance)
     kcal.lens.save_lookup(lookup, path)
-    for which, table, bound, coverage in zip(
-        ("pixels to rays", "rays to pixels"),
-        (lookup.chart_from_pixels, lookup.pixels_from_chart),
-        lookup.bound[::-1],
-        lookup.coverage[::-1],
-        strict=True,
-    ):
+    tables = ("pixels to rays", lookup.chart_from_pixels), ("rays to pixels", lookup.pixels_from_chart)
+    for (which, table), bound, coverage in zip(tables, lookup.bound[::-1], lookup.coverage[::-1], strict=True):
         rows, columns = table.cells.shape
         lost = "" if coverage == 1.0 else f"; answers for {coverage:.1%} of the image's valid pixels"
         out.print(f"{which}: {columns} x {rows} cells, error at most {bound:.1e} px{lost}")

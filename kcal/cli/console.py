@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.markup import escape
@@ -23,6 +23,8 @@ from kcal.errors import DegenerateError, InputError, KcalError
 from kcal.files import replaced, write_atomic
 from kcal.table import Table
 from kcal.texts import one_line, visible
+
+_T = TypeVar("_T")
 
 # Printing for all commands: output, warnings, tables, JSON for programs, and progress bars for long work.
 
@@ -149,11 +151,8 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
 def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
     """A line for each row, in columns that are as wide as they need to be; see `print_table`."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for row in rows:
-        cells = zip(row, widths, strict=True)
-        lines.append("  ".join(cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(cells)))
-    return [line.rstrip() for line in lines]
+    form = "  ".join(f"{{:{'<' if i in left else '>'}{width}}}" for i, width in enumerate(widths))
+    return [form.format(*row).rstrip() for row in rows]
 
 
 def tell_table(name: str, table: Table, left: Collection[int] = (0,)) -> None:
@@ -274,6 +273,14 @@ def steps(description: str, total: int | None) -> Iterator[Callable[..., None]]:
         for other in before:
             _line.update(other, visible=True)
         gc.unfreeze()
+
+
+def followed(description: str, items: Collection[_T], name: Callable[[_T], str]) -> Iterator[_T]:
+    """The items one after the other, with a bar (`steps`) that is told the name of each when it is done."""
+    with steps(description, len(items)) as advance:
+        for item in items:
+            yield item
+            advance(name(item))
 
 
 # Commands that can be pasted, at the end of refusals.

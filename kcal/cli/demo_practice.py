@@ -275,22 +275,15 @@ def practice_score(folder: Path) -> None:
     if step is None:
         out.print("All steps are done.")
         return
-    out.print(f"next: {step.name}, in {folder}:")
-    for command in step.commands:
-        out.print(f"  {command}")
+    out.print("\n  ".join([f"next: {step.name}, in {folder}:", *step.commands]))
 
 
 def next_step(folder: Path) -> Exercise | None:
     """The first step whose files are not all there; what only leads to a step that is done counts as done."""
     others = {"positions.geojson": POSITIONS, "tracks.csv": TRACKS}
-    done = [
-        all(any((folder / name).exists() for name in others.get(made, (made,))) for made in step.makes)
-        for step in STEPS
-    ]
-    for step, own, later in zip(STEPS, done, [*done[1:], False], strict=True):
-        if not own and not (step.leads_on and later):
-            return step
-    return None
+    done = [all(_first(folder, others.get(made, (made,))) for made in step.makes) for step in STEPS]
+    each = zip(STEPS, done, [*done[1:], False], strict=True)
+    return next((step for step, own, later in each if not (own or (step.leads_on and later))), None)
 
 
 def _show(name: str, what: str, table: Table | None) -> None:

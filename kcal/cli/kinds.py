@@ -24,7 +24,6 @@ Pixels = Annotated[float, Kind(metavar="PX")]
 Seconds = Annotated[float, Kind(metavar="S", least=0)]
 Celsius = Annotated[float, Kind(metavar="°C")]
 Hectopascal = Annotated[float, Kind(metavar="HPA")]
-Millimeters = Annotated[float, Kind(metavar="MM")]
 Baseline = Annotated[float, Kind(metavar="M", least=1e-3, setting=True)]
 Count = Annotated[int, Kind(metavar="N", least=1)]
 PixelSigma = Annotated[
@@ -85,8 +84,6 @@ Area = Annotated[tuple[float, ...], Kind(metavar="S,W,N,E", read=_read_area)]
 Unit = Annotated[float, Kind(metavar="UNIT", read=_read_unit)]
 Share = Annotated[float, Kind(metavar="0...1", read=values.share, usage=True)]
 Name = Annotated[str, Kind(metavar="NAME")]
-Inner = Annotated[str, Kind(metavar="CxR")]
-Side = Annotated[str, Kind(metavar="LENGTH")]
 
 
 Times = Annotated[
@@ -198,7 +195,6 @@ RigFile = Annotated[Path, inputs.RIG]
 AnyCamera = Annotated[str, inputs.ANY_CAMERA]
 CameraFile = Annotated[Path, inputs.CAMERA]
 CalibratedCamera = Annotated[Path, inputs.CALIBRATED]
-CalibratedOrRig = Annotated[Path, inputs.CALIBRATED_OR_RIG]
 Observed = Annotated[Path, Kind(metavar="OBS.json"), inputs.OBSERVATIONS]
 Marks = Annotated[Path, Kind(metavar="CSV"), inputs.MARKS]
 Survey = Annotated[Path, Kind(metavar="CSV"), inputs.SURVEY]
@@ -214,15 +210,15 @@ Raster = Annotated[Path, Kind(metavar="RASTER")]
 # Files that are written. A name that no picture can have is refused before anything is computed.
 
 
-def _read_picture(text: str, name: str) -> Path:
-    return check_picture(text)
-
-
 Output = Annotated[Path, Kind(flags=("-o", "--output"))]
 NewFile = Annotated[Path, Kind(flags=("-o", "--output"), writes=True)]
 Picture = Annotated[
     Path,
     Kind(
-        metavar="FILE", read=_read_picture, early=True, writes=True, about="Picture to write (.png, .svg or .pdf): {}"
+        metavar="FILE",
+        read=lambda text, _: check_picture(text),
+        early=True,
+        writes=True,
+        about="Picture to write (.png, .svg or .pdf): {}",
     ),
 ]

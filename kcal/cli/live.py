@@ -16,7 +16,7 @@ import typer
 import kcal
 from kcal.bag import bag_and_topic
 from kcal.cli import kinds, rooms
-from kcal.cli.console import err, on_signals, out, print_wrote, steps, warn
+from kcal.cli.console import err, followed, on_signals, out, print_wrote, steps, warn
 from kcal.cli.inputs import pixel_sigma_of
 from kcal.cli.locate import LocateOptions, pair_localizer
 from kcal.cli.options import Kind, Only, Rare, taken
@@ -380,11 +380,9 @@ def _folder_pairs(watcher: rooms.Watcher, folders: tuple[str, str]) -> Iterator[
     timed = sorted(
         (rooms.image_time(left), left, right) for left, right in rooms.image_pairs(*([folder] for folder in folders))
     )
-    with steps("watching", len(timed)) as advance:
-        for time, left, right in timed:
-            if watcher.due(time):
-                yield time, rooms.read_gray(left), rooms.read_gray(right)
-            advance(left.name)
+    for time, left, right in followed("watching", timed, lambda pair: pair[1].name):
+        if watcher.due(time):
+            yield time, rooms.read_gray(left), rooms.read_gray(right)
 
 
 def _turn_text(noticed: rooms.Noticed) -> str:
@@ -432,11 +430,7 @@ def _draw_turns(watched: kcal.rig.Watched, picture: Path, limit: float, title: s
 
     step = -(-len(watched.times) // _DRAWN)
     times = watched.times[::step]
-    drifts = []
-    with steps("drawing", len(times)) as advance:
-        for time in times:
-            drifts.append(watched.drift_at(time))
-            advance("")
+    drifts = [watched.drift_at(time) for time in followed("drawing", times, lambda _: "")]
     angle = np.degrees(np.stack([drift.relative.numpy() for drift in drifts]))
     sigma = np.degrees(np.stack([drift.relative_covariance.diagonal().sqrt().numpy() for drift in drifts]))
     seen = np.array(watched.seen[::step], bool)

@@ -6,6 +6,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -13,8 +14,8 @@ import typer
 
 import kcal
 from kcal.cli import kinds, rooms
-from kcal.cli.console import err, out, print_answer, print_styled, print_wrote, steps, tell, tell_table, warn
-from kcal.cli.inputs import CAMERA_OR_RIG, pixel_sigma_and_source, pixel_sigma_of, single_camera
+from kcal.cli.console import err, followed, out, print_answer, print_styled, print_wrote, steps, tell, tell_table, warn
+from kcal.cli.inputs import CALIBRATED_OR_RIG, CAMERA_OR_RIG, pixel_sigma_and_source, pixel_sigma_of, single_camera
 from kcal.cli.options import Kind, Several
 from kcal.cli.rig_sources import cameras_of_files, check_views_of
 from kcal.errors import FileError, InputError
@@ -174,11 +175,9 @@ def judged_rig(
     Of a rig that was just solved, `result` has its warnings, its pairs of boards, and what is drawn of it.
     """
     found = []
-    with steps("cameras", len(observations)) as advance:
-        for (side, camera), file in zip(cameras, observations, strict=False):
-            again, made = calibrated_again(camera, file, f"calibrating {side}")
-            found.append(judged(again, made, (), mark_sigma=mark_sigma, name=side, stored=camera))
-            advance("")
+    for file, (side, camera) in zip(followed("cameras", observations, lambda _: ""), cameras, strict=False):
+        again, made = calibrated_again(camera, file, f"calibrating {side}")
+        found.append(judged(again, made, (), mark_sigma=mark_sigma, name=side, stored=camera))
     pairs, unpaired = None, ""
     # Views of a rig that was solved without pairs may be of different moments, though their images are named alike.
     solved_apart = rig.calibration is not None and not rig.calibration.pairs
@@ -225,7 +224,7 @@ _OFTEN = 5.0
 
 
 def check_command(
-    camera: kinds.CalibratedOrRig,
+    camera: Annotated[Path, CALIBRATED_OR_RIG],
     *,
     ranges: kinds.Table | None = None,
     marks: kinds.Marks | None = None,
@@ -372,17 +371,14 @@ def _all_refits(
         out.print(f"{len(done)} refits are done already ({path})", markup=False)
     todo = sorted({*range(count)} - {refit.seed for refit in done})
     saved = time.monotonic()
-    try:
-        with steps("refits", count) as advance:
-            advance("", len(done))
-            for refit in rooms.simulated_refits(result, options, ranges, todo):
-                done.append(refit)
-                advance(f"{len(done)} of {count}")
-                if time.monotonic() - saved > _OFTEN:
-                    _keep_refits(path, key, done)
-                    saved = time.monotonic()
-    except KeyboardInterrupt:
-        pass
+    with suppress(KeyboardInterrupt), steps("refits", count) as advance:
+        advance("", len(done))
+        for refit in rooms.simulated_refits(result, options, ranges, todo):
+            done.append(refit)
+            advance(f"{len(done)} of {count}")
+            if time.monotonic() - saved > _OFTEN:
+                _keep_refits(path, key, done)
+                saved = time.monotonic()
     if todo and done:
         _keep_refits(path, key, done)
     return done, len(done) == count

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import kcal
-from kcal.cli import kinds, rooms
-from kcal.cli.console import aligned, draw_picture, ending_with, look_at_views, mark_again, steps, warn, with_command
+from kcal.cli import console, kinds, rooms
+from kcal.cli.console import aligned, draw_picture, ending_with, followed, look_at_views, mark_again, steps, warn
 from kcal.cli.inputs import pixel_sigma_and_source, typed_with
 from kcal.cli.options import Kind, Rare, Several
 from kcal.cli.stars import Night
@@ -174,24 +174,19 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     given = [*images_by_camera("--scene", words, list(read.cameras)).values()]
     chosen = rooms.image_pairs(*given)
     pairs, found, refused = [], [], list[str]()
-    with steps("matching the scene", len(chosen)) as advance:
-        for left, right in chosen:
-            pair = kcal.rig.ImagePair(left.name, rooms.read_gray(left), rooms.read_gray(right))
-            try:
-                found.append(rooms.match_scene((first, second), pair))
-                pairs.append(pair)
-            except InputError as error:
-                refused.append(str(error))
-            advance(left.name)
+    for left, right in followed("matching the scene", chosen, lambda pair: pair[0].name):
+        pair = kcal.rig.ImagePair(left.name, rooms.read_gray(left), rooms.read_gray(right))
+        try:
+            found.append(rooms.match_scene((first, second), pair))
+            pairs.append(pair)
+        except InputError as error:
+            refused.append(str(error))
     if not pairs:
         raise InputError(f"--scene: {refused[0]}")
     warn(*(f"{text}; left out" for text in refused))
     features, counts = rooms.scene_of((first, second), pairs, found)
     rows: list[tuple[str, ...]] = [("scene", "matched", "no texture", "off the line", "moved", "thinned", "used")]
-    rows += [
-        (one.name, *map(str, (one.matched, one.untextured, one.off_line, one.moved, one.thinned, one.used)))
-        for one in counts
-    ]
+    rows += [tuple(map(str, dataclasses.astuple(one))) for one in counts]
     read.notes += aligned(rows)
     if alone := sum(len(rooms.expand_images(one)) for one in given) - 2 * len(chosen):
         read.notes.append(f"{counted_text(alone, 'image')} of the scene without partner")
@@ -291,17 +286,15 @@ def _named_images(side: str, given: list[str], read: RigReading) -> list[rooms.N
         # A place without a time tells nothing.
         site=None if night.time is None else read.origin,
     )  # fmt: skip
-    with steps(f"naming stars of {side}", len(files)) as advance:
-        for path in files:
-            view = taken.view(path)
-            try:
-                image = kcal.stars.name_stars(rooms.read_night(path), read.cameras[side], view)
-            except KcalError as error:
-                warn(f"{side} {path.name}: {error}; left out")
-            else:
-                warn(*(f"{side} {path.name}: {text}" for text in image.warnings))
-                found.append(image)
-            advance(path.name)
+    for path in followed(f"naming stars of {side}", files, lambda path: path.name):
+        view = taken.view(path)
+        try:
+            image = kcal.stars.name_stars(rooms.read_night(path), read.cameras[side], view)
+        except KcalError as error:
+            warn(f"{side} {path.name}: {error}; left out")
+        else:
+            warn(*(f"{side} {path.name}: {text}" for text in image.warnings))
+            found.append(image)
     warn(*(f"{side}, image {number + 1} with names: {text}" for number, text in rooms.clock_doubts(found)))
     if not found:
         raise InputError(f"--stars: in none of the {len(files)} images of {side} stars have names")
@@ -614,7 +607,7 @@ def read_sources(
     """Read everything; warnings about it are printed. Two cameras are left and right, one or more have their names."""
     if (sources.landmarks is None) != (sources.marks is None):
         text = "--landmarks and --marks belong together: places by name, and where they are in the images"
-        raise InputError(with_command(text, _cure_of("marks", sources, paths)))
+        raise InputError(console.with_command(text, _cure_of("marks", sources, paths)))
     if sources.terrain is None and (sources.skyline or sources.skyline_picture is not None):
         raise InputError("--skyline and --skyline-picture need the raster of the terrain: --terrain DEM.tif")
     known = CAMERAS if len(cameras) == 2 else names

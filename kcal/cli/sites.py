@@ -152,7 +152,7 @@ def budget_command(
     timing: kinds.Seconds = 0.01,
     speed: Annotated[float, Kind(metavar="M/S", least=0)] = 20.0,
     picture: kinds.Picture | None = None,
-    aperture: kinds.Millimeters | None = None,
+    aperture: Annotated[float, Kind(metavar="MM")] | None = None,
     pitch: Annotated[kinds.Degrees, Kind(of="aperture")] = 0.0,
     clock_sigma: Annotated[kinds.Seconds, Kind(of="aperture")] = 0.01,
 ) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import kcal
 from kcal.cli import kinds, rooms
-from kcal.cli.console import out, print_styled, print_table, print_wrote, steps, tell, warn
+from kcal.cli.console import followed, out, print_styled, print_table, print_wrote, steps, tell, warn
 from kcal.cli.inputs import single_camera
 from kcal.cli.options import Kind
 from kcal.errors import InputError, KcalError
@@ -52,15 +52,13 @@ def camera_by_stars(
     """The camera of night images, and of what boards said of it before; and the images' size."""
     stars: list[rooms.DetectedStars] = []
     sizes = set()
-    with steps("finding stars", len(files)) as advance:
-        for path in files:
-            try:
-                image = rooms.read_night(path)
-                stars.append(kcal.stars.detect_stars(image))
-            except KcalError as error:
-                raise InputError(f"{path.name}: {error}") from error
-            sizes.add((image.shape[1], image.shape[0]))
-            advance(path.name)
+    for path in followed("finding stars", files, lambda path: path.name):
+        try:
+            image = rooms.read_night(path)
+            stars.append(kcal.stars.detect_stars(image))
+        except KcalError as error:
+            raise InputError(f"{path.name}: {error}") from error
+        sizes.add((image.shape[1], image.shape[0]))
     if len(sizes) > 1:
         raise InputError(f"the images have several sizes ({sorted(sizes)}): one camera has one")
     (size,) = sizes
@@ -253,32 +251,28 @@ def stars_command(
     angles = ["heading", "pitch", "roll", "± east", "± north", "± up"]
     if not views[0].on_earth:
         angles = ["right ascension", "declination", "± x", "± y", "± z"]
-    rows = [["image", "stars", "named", "RMS px", *angles, "left out"]]
-    with steps("naming stars", len(files)) as advance:
-        for path, view in zip(files, views, strict=True):
-            try:
-                image = rooms.read_night(path)
-                found = kcal.stars.name_stars(image, lens, view, catalog)
-            except KcalError as error:
-                if len(files) == 1:
-                    raise
-                told.append({"image": path.name, "identified": 0, "error": str(error)})
-                warn(f"{path.name}: {error}")
-            else:
-                if picture is not None and not seen:
-                    _draw(picture, image, found, catalog, path.name)
-                told.append(_told(path, found))
-                seen.append((told[-1], found))
-                rows.append(_row(told[-1], found))
-                warn(*(f"{path.name}: {text}" for text in found.warnings))
-            advance(path.name)
+    for path, view in zip(followed("naming stars", files, lambda path: path.name), views, strict=True):
+        try:
+            image = rooms.read_night(path)
+            found = kcal.stars.name_stars(image, lens, view, catalog)
+        except KcalError as error:
+            if len(files) == 1:
+                raise
+            told.append({"image": path.name, "identified": 0, "error": str(error)})
+            warn(f"{path.name}: {error}")
+        else:
+            if picture is not None and not seen:
+                _draw(picture, image, found, catalog, path.name)
+            told.append(_told(path, found))
+            seen.append((told[-1], found))
+            warn(*(f"{path.name}: {text}" for text in found.warnings))
     for number, text in rooms.clock_doubts([found for _, found in seen]):
         warn(f"{seen[number][0]['image']}: {text}")
         seen[number][0]["warnings"].append(text)
     tell(images=told)
-    if len(rows) == 1:
+    if not seen:
         raise InputError(f"in none of {len(files)} images stars have names")
-    print_table(rows)
+    print_table([["image", "stars", "named", "RMS px", *angles, "left out"], *(_row(*one) for one in seen)])
     if views[0].on_earth and night.dut1 is None:
         out.print("UT1 - UTC is not known (--dut1): it is part of the σ about the Earth's axis with 8″")
     print_wrote(picture)

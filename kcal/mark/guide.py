@@ -278,12 +278,11 @@ class Pyramid:
         Raises:
             InputError: no such tile.
         """
-        whole = self.image.shape
-        if not 0 <= number <= top_level(whole) or column < 0 or row < 0:
+        places = zip((row, column), self.image.shape, strict=True)
+        known = 0 <= number <= top_level(self.image.shape)
+        if not (known and all(0 <= TILE * at < size >> number for at, size in places)):
             raise InputError(f"no tile {column}, {row} at level {number}")
         part = self.level(number)[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
-        if part.size == 0:
-            raise InputError(f"no tile {column}, {row} at level {number}")
         if part.dtype == np.uint8 and span is None:
             return part.astype(np.uint8, copy=False)
         low, high = span or self.span

@@ -468,12 +468,11 @@ def pair_covariance(item: marking.Item) -> Tensor:
         else torch.tensor([[mark.cov[0], mark.cov[1]], [mark.cov[1], mark.cov[2]]], dtype=torch.float64)
         for mark in (item.left, item.right)
     )
-    zero = torch.zeros_like(left)
-    if item.cross is None:
-        return torch.block_diag(left, right)
-    shared = left if item.cross == "left" else right
-    own_left, own_right = (zero, right) if item.cross == "left" else (left, zero)
-    return torch.cat([torch.cat([shared + own_left, shared], 1), torch.cat([shared, shared + own_right], 1)])
+    if item.cross == "left":
+        return torch.block_diag(torch.zeros_like(left), right) + left.repeat(2, 2)
+    if item.cross == "right":
+        return torch.block_diag(left, torch.zeros_like(right)) + right.repeat(2, 2)
+    return torch.block_diag(left, right)
 
 
 def _write_if_new(path: Path, text: str) -> None:

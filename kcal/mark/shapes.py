@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -25,6 +26,8 @@ from kcal.errors import InputError
 # and blur are searched. Blur is Gaussian, and with it the pixel's own width.
 
 Floats = NDArray[np.float64]
+# Of parameters to residuals, or of columns (N, K) to white ones.
+_Map: TypeAlias = Callable[[Floats], Floats]
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 SEEN = 0.01  # of the largest weight: pixels that count less are left out
 _CONVERGED = 5e-4  # pixels: the last step of a converged point is shorter
@@ -172,30 +175,42 @@ def fit_shape(
     """
     used = weight > SEEN
     where, levels, weight = where[used], levels[used], weight[used]
-    root = np.sqrt(weight)
-
-    def whiten(columns: Floats) -> Floats:
-        return root[:, None] * columns
-
+    whiten = functools.partial(np.multiply, np.sqrt(weight)[:, None])
     residual = _whitened_residual(shape, where, levels, whiten)
     costs = [0.0] if len(starts) == 1 else [float(np.square(residual(p)).sum()) for p in starts]
     return improve(shape, starts[int(np.argmin(costs))], where, levels, weight, whiten, iterations)
 
 
 def improve(
-    shape: ShapeModel,
-    start: Floats,
-    where: Floats,
-    levels: Floats,
-    weight: Floats,
-    whiten: Callable[[Floats], Floats],
-    iterations: int = 15,
+    shape: ShapeModel, start: Floats, where: Floats, levels: Floats, weight: Floats, whiten: _Map, iterations: int = 15
 ) -> ShapeFit | None:
     """Least squares from one start (P,); `whiten` makes the errors of columns (N, K) independent and of equal size."""
     residual = _whitened_residual(shape, where, levels, whiten)
     low, high = np.array([-6.0, -6.0, *shape.low]), np.array([6.0, 6.0, *shape.high])
-    best = _minimized(residual, start, low, high, iterations)
-    return _described(shape, best, residual, weight, whiten(levels[:, None])[:, 0])
+    p = _minimized(residual, start, low, high, iterations)
+    r = residual(p)
+    jacobian = slopes(residual, p, r)
+    length = np.linalg.norm(jacobian, axis=0) + 1e-12
+    scaled = jacobian / length
+    normal = scaled.T @ scaled
+    patterns = shape.patterns(np.zeros((1, 2)), p).shape[1] + 2
+    count = float(weight.sum())
+    freedom = max(count - len(p) - patterns, 1.0)
+    noise2 = float(r @ r) / freedom
+    # Parameters at a bound, or that do not matter, drop out; the point itself must be determined.
+    values, vectors = np.linalg.eigh(normal)
+    if values[-1] <= 0:
+        return None
+    inverse = (vectors / np.maximum(values, 1e-9 * values[-1])) @ vectors.T
+    # Weights shape the window and are not inverse variances: the noise is that of single pixels.
+    middle = noise2 * (scaled * weight[:, None]).T @ scaled
+    covariance = (inverse @ middle @ inverse)[:2, :2] / np.outer(length[:2], length[:2])
+    target, root = whiten(levels[:, None])[:, 0], np.sqrt(weight)
+    mean = float((root * target).sum()) / count
+    total = float(np.square(target - root * mean).sum())
+    explained = 1 - float(r @ r) / max(total, 1e-12)
+    score = count * math.log(max(noise2, 1e-3) * freedom / count) + (len(p) + patterns) * math.log(count)
+    return ShapeFit(shape.name, p, p[:2], covariance, math.sqrt(noise2), explained, score)
 
 
 def design_of(shape: ShapeModel, where: Floats, p: Floats) -> Floats:
@@ -203,9 +218,7 @@ def design_of(shape: ShapeModel, where: Floats, p: Floats) -> Floats:
     return np.concatenate([shape.patterns(where, p), where / np.abs(where).max()], 1)
 
 
-def _whitened_residual(
-    shape: ShapeModel, where: Floats, levels: Floats, whiten: Callable[[Floats], Floats]
-) -> Callable[[Floats], Floats]:
+def _whitened_residual(shape: ShapeModel, where: Floats, levels: Floats, whiten: _Map) -> _Map:
     def residual(p: Floats) -> Floats:
         columns = whiten(np.concatenate([design_of(shape, where, p), levels[:, None]], 1))
         design, target = columns[:, :-1], columns[:, -1]
@@ -221,9 +234,7 @@ def starts_at(shape: ShapeModel, points: Floats) -> Floats:
     return np.concatenate([np.concatenate([np.tile(at, (len(shape.starts), 1)), shape.starts], 1) for at in points])
 
 
-def _minimized(
-    residual: Callable[[Floats], Floats], start: Floats, low: Floats, high: Floats, iterations: int
-) -> Floats:
+def _minimized(residual: _Map, start: Floats, low: Floats, high: Floats, iterations: int) -> Floats:
     """Levenberg-Marquardt with slopes by differences; parameters stay inside their bounds."""
     p, damping = np.clip(start, low, high), 1e-3
     r = residual(p)
@@ -250,42 +261,9 @@ def _minimized(
     return p
 
 
-def slopes(residual: Callable[[Floats], Floats], p: Floats, r: Floats) -> Floats:
+def slopes(residual: _Map, p: Floats, r: Floats) -> Floats:
     """(N, P) of residuals by parameters, by differences."""
-    columns = []
-    for k in range(len(p)):
-        moved = p.copy()
-        moved[k] += 1e-5
-        columns.append((residual(moved) - r) / 1e-5)
-    return np.stack(columns, -1)
-
-
-def _described(
-    shape: ShapeModel, p: Floats, residual: Callable[[Floats], Floats], weight: Floats, target: Floats
-) -> ShapeFit | None:
-    r = residual(p)
-    jacobian = slopes(residual, p, r)
-    length = np.linalg.norm(jacobian, axis=0) + 1e-12
-    scaled = jacobian / length
-    normal = scaled.T @ scaled
-    patterns = shape.patterns(np.zeros((1, 2)), p).shape[1] + 2
-    count = float(weight.sum())
-    freedom = max(count - len(p) - patterns, 1.0)
-    noise2 = float(r @ r) / freedom
-    # Parameters at a bound, or that do not matter, drop out; the point itself must be determined.
-    values, vectors = np.linalg.eigh(normal)
-    if values[-1] <= 0:
-        return None
-    inverse = (vectors / np.maximum(values, 1e-9 * values[-1])) @ vectors.T
-    # Weights shape the window and are not inverse variances: the noise is that of single pixels.
-    middle = noise2 * (scaled * weight[:, None]).T @ scaled
-    covariance = (inverse @ middle @ inverse)[:2, :2] / np.outer(length[:2], length[:2])
-    root = np.sqrt(weight)
-    mean = float((root * target).sum()) / count
-    total = float(np.square(target - root * mean).sum())
-    explained = 1 - float(r @ r) / max(total, 1e-12)
-    score = count * math.log(max(noise2, 1e-3) * freedom / count) + (len(p) + patterns) * math.log(count)
-    return ShapeFit(shape.name, p, p[:2], covariance, math.sqrt(noise2), explained, score)
+    return np.stack([(residual(p + step) - r) / 1e-5 for step in 1e-5 * np.eye(len(p))], -1)
 
 
 # A shape fitted again where what stands behind it has a texture: its gray levels are alike in neighboring pixels.
@@ -337,10 +315,7 @@ def fit_before_texture(shape: ShapeModel, fit: ShapeFit, where: Floats, levels: 
     unknowns = np.concatenate([design, slopes(modeled, fit.parameters, modeled(fit.parameters))], 1)
     found = texture_of(where, left_over, unknowns)
     half = cholesky(found.strength * np.exp(-cdist(where, where) / found.length) + np.eye(len(where)), lower=True)
-
-    def whiten(columns: Floats) -> Floats:
-        return solve_triangular(half, columns, lower=True, check_finite=False)
-
+    whiten = functools.partial(solve_triangular, half, lower=True, check_finite=False)
     again = improve(shape, fit.parameters, where, levels, np.ones(len(where)), whiten)
     if again is None:
         return fit
@@ -457,7 +432,14 @@ def snap(image: Gray, u: float, v: float) -> Snapped:
     if best is not None:
         cov = best.covariance + _MODEL_SIGMA**2 * np.eye(2)
         return Snapped(column + float(best.point[0]), row + float(best.point[1]), three_of(cov), best.shape)
-    return _by_edges(image, u, v)
+    # Only the surroundings are converted: the image may have 24 million pixels.
+    top, left = max(round(v) - 24, 0), max(round(u) - 24, 0)
+    crop = torch.from_numpy(image[top : top + 49, left : left + 49].astype(np.float64))
+    found = refine_point(crop, torch.tensor([u - left, v - top], dtype=torch.float64))
+    covariance = found.covariance.numpy() + _MODEL_SIGMA**2 * np.eye(2)
+    if math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])) > _LARGEST_SIGMA:
+        raise InputError("nothing here determines a point: no corner, cross, blob or end; mark it by hand")
+    return Snapped(left + float(found.pixel[0]), top + float(found.pixel[1]), three_of(covariance), "edges")
 
 
 def _best_shape(levels: Floats, click: Floats) -> ShapeFit | None:
@@ -502,17 +484,6 @@ def _is_determined(fit: ShapeFit, click: Floats) -> bool:
     sigma = math.sqrt(max(float(np.linalg.eigvalsh(fit.covariance)[-1]), 0.0))
     near = float(np.linalg.norm(fit.point - click)) <= REACH
     return near and 0 < sigma <= _LARGEST_SIGMA and fit.explained >= _LEAST_EXPLAINED
-
-
-def _by_edges(image: Gray, u: float, v: float) -> Snapped:
-    # Only the surroundings are converted: the image may have 24 million pixels.
-    top, left = max(round(v) - 24, 0), max(round(u) - 24, 0)
-    crop = torch.from_numpy(image[top : top + 49, left : left + 49].astype(np.float64))
-    found = refine_point(crop, torch.tensor([u - left, v - top], dtype=torch.float64))
-    covariance = found.covariance.numpy() + _MODEL_SIGMA**2 * np.eye(2)
-    if math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])) > _LARGEST_SIGMA:
-        raise InputError("nothing here determines a point: no corner, cross, blob or end; mark it by hand")
-    return Snapped(left + float(found.pixel[0]), top + float(found.pixel[1]), three_of(covariance), "edges")
 
 
 def three_of(covariance: Floats | Tensor) -> tuple[float, float, float]:

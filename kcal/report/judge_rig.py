@@ -184,7 +184,8 @@ def rig_verdict(
             action = "give the observations of the pairs (--observations LEFT RIGHT)"
             findings.append(Finding("synchronization", "doubt", text, action))
     beyond = [verdict.unexplained for verdict in cameras]
-    worst = [_worst_sigmas(rig, requirement.distance, mark_sigma) for requirement in requirements]
+    worst_of = _worst_of_pair if rig.is_pair else station_sigmas
+    worst = [worst_of(rig, requirement.distance, pixel_sigma=mark_sigma) for requirement in requirements]
     both = list(zip(requirements, worst, strict=True))
     findings += [_unseen_finding(requirement.distance) for requirement, one in both if one is None]
     answers = tuple(_rig_answer(requirement, one, rig.known, mark_sigma, beyond) for requirement, one in both)
@@ -224,7 +225,7 @@ def _rig_answer(
 
     Args:
         requirement: a range, and how well it must be known.
-        worst: of `_worst_sigmas`.
+        worst: of several places that two cameras see; None where there is none.
         known: whether anything is known of the errors of lenses and pose.
         mark_sigma: noise of a mark along each axis, px.
         beyond: px by which each camera is wrong beyond its error bars.
@@ -239,21 +240,14 @@ def _rig_answer(
     return RangeAnswer(requirement=requirement, parts=parts)
 
 
-def _worst_sigmas(rig: Rig, distance: float, mark_sigma: float) -> RangeSigmas | None:
-    """The worst of several places that two cameras see; None where there is none."""
-    if rig.is_pair:
-        return _worst_of_pair(rig, distance, mark_sigma)
-    return station_sigmas(rig, distance, pixel_sigma=mark_sigma)
-
-
-def _worst_of_pair(rig: Rig, distance: float, mark_sigma: float) -> RangeSigmas:
+def _worst_of_pair(rig: Rig, distance: float, *, pixel_sigma: float) -> RangeSigmas:
     """The worst of several places along the middle row of the left image that both cameras see."""
     width, height = rig.left.size
     worst: RangeSigmas | None = None
     places = [None, *([0.5 * width + share * width, 0.5 * height] for share in (-0.3, 0.3))]
     for place in places:
         try:
-            found = range_sigmas(rig, [distance], pixel_sigma=mark_sigma, pixel=place)
+            found = range_sigmas(rig, [distance], pixel_sigma=pixel_sigma, pixel=place)
         except InputError:
             if place is None:
                 raise

@@ -123,8 +123,7 @@ def local_image(path: str | Path) -> dict[str, Any]:
             raise InputError(f"{path}: does not lie on a Web Mercator map")
         picture = _warp(pixels, matrix, to_map, (min(x), min(y), max(x), max(y)))
         back = pyproj.Transformer.from_crs("EPSG:3857", "EPSG:4326", always_xy=True)
-        west, south = back.transform(min(x), min(y))
-        east, north = back.transform(max(x), max(y))
+        (west, east), (south, north) = back.transform((min(x), max(x)), (min(y), max(y)))
     except ProjError as error:
         raise InputError(f"{path}: its coordinate system cannot be used: {error}") from error
     webp = io.BytesIO()
@@ -344,9 +343,7 @@ def _popup_rows(position: places.Position, unit: Unit) -> list[tuple[str, str]]:
 
 
 def _box(content: dict[str, Any]) -> tuple[float, float, float, float]:
-    spots: list[LatLon] = [*content["truth"], *(spot["place"] for spot in content["points"])]
-    spots += [camera["place"] for camera in content["cameras"]]
-    for line in (*content["regions"], *content["bearings"]):
-        spots += line
+    spots: list[LatLon] = [*content["truth"], *(one["place"] for one in content["points"] + content["cameras"])]
+    spots += [spot for line in content["regions"] + content["bearings"] for spot in line]
     lats, lons = zip(*spots, strict=True)
     return min(lats), min(lons), max(lats), max(lons)

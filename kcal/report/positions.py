@@ -464,11 +464,9 @@ def siting_figure(
         colored, panels[-1], "standard deviation of a position on the map", ticks=levels, format=lengths
     )
     patches = [Patch(color=_SINGLE, label="one site sees it: a bearing only"), Patch(color=_HIDDEN, label="hidden")]
-    marks = [axes.plot([], [], "^", color="white", markeredgecolor="black", markersize=9, label="site")[0]]
+    marks = axes.plot([], [], "^", color="white", markeredgecolor="black", markersize=9, label="site")
     if ranked:
-        marks.append(
-            axes.plot([], [], "o", color=_NEW, markeredgecolor="black", label="candidate, by rank; new site")[0]
-        )
+        marks += axes.plot([], [], "o", color=_NEW, markeredgecolor="black", label="candidate, by rank; new site")
     figure.legend(handles=[*patches, *marks], loc="outside upper left", ncols=4, frameon=False, fontsize=9)
     return figure
 
@@ -492,14 +490,10 @@ def _sigma_levels(maps: Sequence[SitingMap]) -> list[float]:
     return figures.round_levels(max(float(low), 1e-3), float(high), least=2)
 
 
-def _map_grid(area: Area) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    lats, lons = torch.meshgrid(area.lat, (area.lon + 180.0) % 360.0 - 180.0, indexing="ij")
-    east, north, _ = geodetic_to_enu(torch.stack([lats, lons, torch.zeros_like(lats)], -1), area.origin).unbind(-1)
-    return east.numpy() / 1e3, north.numpy() / 1e3
-
-
 def _siting_area(axes: Axes, area: Area, found: SitingMap, levels: Sequence[float]) -> Any:
-    east, north = _map_grid(area)
+    lats, lons = torch.meshgrid(area.lat, (area.lon + 180.0) % 360.0 - 180.0, indexing="ij")
+    places = geodetic_to_enu(torch.stack([lats, lons, torch.zeros_like(lats)], -1), area.origin)
+    east, north, _ = (axis.numpy() / 1e3 for axis in places.unbind(-1))
     count = np.where(area.known.numpy(), found.seen_by.numpy(), np.nan).astype(float)
     blind = np.where(count == 0, 0.0, np.where(count == 1, 1.0, np.nan))
     axes.pcolormesh(east, north, blind, cmap=ListedColormap([_HIDDEN, _SINGLE]), vmin=0, vmax=1, rasterized=True)

@@ -62,17 +62,16 @@ def interval_text(position: Position, unit: Unit) -> str:
 
 
 def _position_row(position: Position, unit: Unit) -> list[str]:
-    numbers = ["", "", "", ""]
+    place: list[str] = []
     if position.lat is not None and position.lon is not None and position.height is not None:
         # 1e-7° are 11 mm.
         degrees = 9 if unit.meters < M.meters else 7
         up = None if position.covariance is None else math.sqrt(position.covariance[2][2])
         place = [f"{position.lat:.{degrees}f}", f"{position.lon:.{degrees}f}", number_text(position.height, up)]
-        numbers = [*place, unit.number(position.range_m or 0.0, range_sigma(position))]
     elif position.enu is not None and position.covariance is not None:
         sigmas = [math.sqrt(row[axis]) for axis, row in enumerate(position.covariance)]
         place = [number_text(value, sigma) for value, sigma in zip(position.enu, sigmas, strict=True)]
-        numbers = [*place, unit.number(position.range_m or 0.0, range_sigma(position))]
+    numbers = [*place, unit.number(position.range_m or 0.0, range_sigma(position))] if place else [""] * 4
     status = position.status.name.lower().replace("_", " ")
     return [position.name, *numbers, interval_text(position, unit), f"{status} *" if position.reason else status]
 
