@@ -20,7 +20,7 @@ import pytest
 import torch
 import typer
 from board_render import homography, render
-from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
+from calibrate_scenes import BOARD, camera, corner_pixels, observe, pixels_of
 from command_line import Command
 from locate_rigs import pinhole_rig
 from rich.console import Console
@@ -489,8 +489,7 @@ PAIRS = "rig left.camera.json right.camera.json -o rig.json --pairs"
 @pytest.fixture(scope="module")
 def refusal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     here = tmp_path_factory.mktemp("refused")
-    truth = camera("opencv5")
-    pixels = pixels_of(truth, motions(truth, 12, 1), noise=0.05)
+    pixels = corner_pixels(12, 1, noise=0.05)
     observe(pixels[:2]).save(here / "few.obs.json")
     wild = pixels.clone()
     wild[::2] = wild[::2][:, torch.randperm(42, generator=torch.Generator().manual_seed(0))]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from board_render import render
-from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
+from calibrate_scenes import BOARD, corner_pixels, observe
 from interrupted import interrupt
 from typer.testing import CliRunner, Result
 
@@ -104,8 +104,7 @@ def test_long_work(line: str, moments: list[str], site: Path) -> None:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Observations and images of a camera, and a rig of others with marked landmarks."""
     folder = tmp_path_factory.mktemp("site")
-    truth = camera("opencv5")
-    seen = observe(pixels_of(truth, motions(truth, 10, 1), noise=0.05))
+    seen = observe(corner_pixels(10, 1, noise=0.05))
     seen.save(folder / "left.obs.json")
     calibrate_camera(seen, CalibrationOptions(model="opencv5")).save(folder / "near.camera.json", name="near")
     for place in ("images", "cameras/a", "cameras/b"):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from calibrate_scenes import camera, motions, observe, pixels_of
+from calibrate_scenes import camera, corner_pixels, motions, observe, pixels_of
 from command_line import Command, rows_of
 from typer.testing import CliRunner
 
@@ -207,8 +207,7 @@ RUNNER = CliRunner()
 
 
 def write(path: Path, count: int, seed: int = 1, model: str = "opencv4") -> Path:
-    truth = camera(model)
-    observe(pixels_of(truth, motions(truth, count, seed), noise=0.1, seed=seed)).save(path)
+    observe(corner_pixels(count, seed, model, noise=0.1, seed=seed)).save(path)
     return path
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 from browser import chromium_page, needs_browser
-from calibrate_scenes import camera, motions, observe, pixels_of
+from calibrate_scenes import corner_pixels, observe
 from command_line import invoked, rows_of
 from locate_rigs import pinhole_rig
 from typer.testing import CliRunner
@@ -35,8 +35,7 @@ def kcal(*words: object) -> tuple[int, str]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Observations of an opencv5 camera, and that camera calibrated."""
     here = tmp_path_factory.mktemp("report")
-    truth = camera("opencv5")
-    observe(pixels_of(truth, motions(truth, 14, 3), noise=0.05)).save(here / "left.obs.json")
+    observe(corner_pixels(14, 3, noise=0.05)).save(here / "left.obs.json")
     words = ("calibrate", here / "left.obs.json", "-o", here / "left.camera.json", "--model", "opencv5")
     code, text = kcal(*words, "--temperature", 21.5)
     assert code == 0

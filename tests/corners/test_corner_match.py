@@ -65,23 +65,20 @@ class TestRefinePoint:
         assert 0.5 < float(predicted / spread) < 4.0
 
     def test_refusals(self):
-        with pytest.raises(InputError, match="no corner"):
-            refine_point(torch.full((40, 40), 7.0), torch.tensor([20.0, 20.0]))
         edge = torch.special.ndtr(torch.arange(40.0, dtype=torch.float64) - 20.2).expand(40, 40)
-        with pytest.raises(InputError, match="no corner"):
-            refine_point(edge, torch.tensor([20.0, 20.0]))
-        with pytest.raises(InputError, match="border"):
-            refine_point(corner_image(5, 5), torch.tensor([3.0, 20.0]))
-        with pytest.raises(InputError, match="away"):
-            refine_point(corner_image(30.0, 30.0), torch.tensor([36.0, 36.0]))
-        with pytest.raises(InputError, match=r"\(H, W\)"):
-            refine_point(torch.zeros(3, 40, 40), torch.tensor([20.0, 20.0]))
-        with pytest.raises(InputError, match="ndarray"):
-            refine_point(np.zeros((40, 40)), torch.tensor([20.0, 20.0]))
         dead = corner_image(30.0, 30.0)
         dead[25, 25] = math.nan
-        with pytest.raises(InputError, match="image: 1 of 3600 values are not finite"):
-            refine_point(dead, torch.tensor([30.0, 30.0]))
+        for image, place, told in (
+            (torch.full((40, 40), 7.0), (20.0, 20.0), "no corner"),
+            (edge, (20.0, 20.0), "no corner"),
+            (corner_image(5, 5), (3.0, 20.0), "border"),
+            (corner_image(30.0, 30.0), (36.0, 36.0), "away"),
+            (torch.zeros(3, 40, 40), (20.0, 20.0), r"\(H, W\)"),
+            (np.zeros((40, 40)), (20.0, 20.0), "ndarray"),
+            (dead, (30.0, 30.0), "image: 1 of 3600 values are not finite"),
+        ):
+            with pytest.raises(InputError, match=told):
+                refine_point(image, torch.tensor(place))
 
 
 def texture(seed, points):

@@ -251,6 +251,15 @@ def ideal(parameters, size=41):
     return levels.reshape(size, size)
 
 
+def blurred(pattern, where, reach, step, sigma):
+    """A pattern at places (N, 2), integrated against a Gaussian on a fine grid: no series, no error functions."""
+    fine = torch.arange(-reach, reach, step, dtype=torch.float64) + step / 2
+    v, u = torch.meshgrid(fine, fine, indexing="ij")
+    kernel = torch.exp(-0.5 * (u**2 + v**2) / sigma**2)
+    kernel = kernel / kernel.sum()
+    return torch.stack([(pattern(x - u, y - v) * kernel).sum() for x, y in where.tolist()])
+
+
 class TestCrossing:
     def test_order_of_the_parameters(self):
         assert NAMES == (
@@ -275,52 +284,42 @@ class TestCrossing:
 
     @pytest.mark.parametrize("opening", [90.0, 70.0, 50.0])
     def test_values_are_the_blurred_pattern(self, opening):
-        # The pattern sign(d1) sign(d2) integrated against a Gaussian on a fine grid: no series, no error functions.
         angles = 0.3, 0.3 + math.radians(opening)
-        fine = torch.arange(-9, 9, 0.02, dtype=torch.float64) + 0.01
-        v, u = torch.meshgrid(fine, fine, indexing="ij")
-        kernel = torch.exp(-0.5 * (u**2 + v**2) / 1.3**2)
-        kernel = kernel / kernel.sum()
+
+        def pattern(x, y):
+            sides = [(math.cos(a) * y - math.sin(a) * x).sign() for a in angles]
+            return sides[0] * sides[1]
+
         where = torch.tensor([[0.0, 0.0], [0.5, 0.2], [-1.0, 0.7], [2.0, 1.0], [0.3, -1.8]], dtype=torch.float64)
-        wanted = []
-        for x, y in where.tolist():
-            sides = [(math.cos(a) * (y - v) - math.sin(a) * (x - u)).sign() for a in angles]
-            wanted.append((sides[0] * sides[1] * kernel).sum())
+        wanted = blurred(pattern, where, 9, 0.02, 1.3)
         parameters = torch.tensor([0, 0, *angles, math.log(1.3), 0, 1, 0, 0, 0]).double()
         levels, _ = crossing(parameters, where, torch.zeros(2, dtype=torch.float64))
         # 4e-4: steps of 0.02 px in the integral; at 50° the series leaves out 2e-3.
-        torch.testing.assert_close(levels, torch.stack(wanted), rtol=0, atol=3e-3 if opening == 50.0 else 6e-4)
+        torch.testing.assert_close(levels, wanted, rtol=0, atol=3e-3 if opening == 50.0 else 6e-4)
 
     def test_values_of_bent_lines_are_the_blurred_pattern(self):
         """A blurred bent edge lies beside the line itself, by half the bend times the blur squared."""
         bend, blur = torch.tensor([0.02, 0.0], dtype=torch.float64), 1.0
-        fine = torch.arange(-6, 6, 0.02, dtype=torch.float64) + 0.01
-        v, u = torch.meshgrid(fine, fine, indexing="ij")
-        kernel = torch.exp(-0.5 * (u**2 + v**2) / blur**2)
-        kernel = kernel / kernel.sum()
+
+        def pattern(x, y):
+            # Edge 1 lies along x with its normal along y, edge 2 along y with its normal along -x.
+            return (y - 0.5 * bend[0] * x**2).sign() * (-x).sign()
+
         # Three sigmas beside the other edge: nearer, both bend into each other, which is left out.
         where = torch.tensor([[3.0, 0.0], [3.0, 0.5], [-3.0, 0.2], [-3.0, -0.4]], dtype=torch.float64)
-        wanted = []
-        for x, y in where.tolist():
-            # Edge 1 lies along x with its normal along y, edge 2 along y with its normal along -x.
-            sides = ((y - v) - 0.5 * bend[0] * (x - u) ** 2).sign() * (u - x).sign()
-            wanted.append((sides * kernel).sum())
+        wanted = blurred(pattern, where, 6, 0.02, blur)
         parameters = torch.tensor([0, 0, 0, math.pi / 2, math.log(blur), 0, 1, 0, 0, 0]).double()
         # 0.01 px of shift changes these by 0.008.
-        torch.testing.assert_close(crossing(parameters, where, bend)[0], torch.stack(wanted), rtol=0, atol=2e-3)
+        torch.testing.assert_close(crossing(parameters, where, bend)[0], wanted, rtol=0, atol=2e-3)
 
     def test_values_are_those_of_the_next_squares_too(self):
-        # Lines 4 px to the right (more squares) and 5 px below (the margin, light), as they are in `wanted`.
-        fine = torch.arange(-16, 16, 0.04, dtype=torch.float64) + 0.02
-        v, u = torch.meshgrid(fine, fine, indexing="ij")
-        kernel = torch.exp(-0.5 * (u**2 + v**2) / 2.0**2)
-        kernel = kernel / kernel.sum()
+        def pattern(x, y):
+            # Lines 4 px to the right (more squares) and 5 px below (the margin, light).
+            across = x.sign() * torch.where(x > 4, -1.0, 1.0)
+            return torch.where(y > 5, 1.0, across * y.sign())
+
         where = torch.tensor([[0.0, 0.0], [2.0, 1.0], [3.0, -2.0], [-2.0, 3.5], [3.0, 3.0]], dtype=torch.float64)
-        wanted = []
-        for x, y in where.tolist():
-            across = (x - u).sign() * torch.where(x - u > 4, -1.0, 1.0)
-            pattern = torch.where(y - v > 5, 1.0, across * (y - v).sign())
-            wanted.append((pattern * kernel).sum())
+        wanted = blurred(pattern, where, 16, 0.04, 2.0)
         # Edge 1 lies along y (its normal is -x), edge 2 along x.
         parameters = torch.tensor([0, 0, math.pi / 2, 0.0, math.log(2.0), 0, -1, 0, 0, 0]).double()
         turn = torch.tensor([[0.0, 1.0], [0.5, 0.0]]).double()[..., None]
@@ -328,7 +327,7 @@ class TestCrossing:
         levels, _ = crossing(parameters, where, torch.zeros(2, dtype=torch.float64), LineDistances(distance, turn))
         # The margin begins beyond the last square, whose tail there is left out: 2 % at the last place, which is 1 px
         # from both lines.
-        torch.testing.assert_close(levels[:4], torch.stack(wanted)[:4], rtol=0, atol=6e-3)
+        torch.testing.assert_close(levels[:4], wanted[:4], rtol=0, atol=6e-3)
         assert float((levels[4] - wanted[4]).abs()) < 0.1
 
 

@@ -75,6 +75,12 @@ def pixels_of(truth: Camera, poses: Motions, *, board: Board = BOARD, noise: flo
     return pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
 
 
+def corner_pixels(count: int, poses: int, model: str = "opencv5", **noise: Any) -> Tensor:
+    """Corners (V, N, 2) in so many poses, drawn from the seed `poses`, with the noise of `pixels_of`."""
+    truth = camera(model)
+    return pixels_of(truth, motions(truth, count, poses), **noise)
+
+
 def observe(
     pixels: Tensor,
     *,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from calibrate_scenes import camera, motions, observe, pixels_of
+from calibrate_scenes import corner_pixels, observe
 from capture_frames import BOARD as PHOTOGRAPHED
 from capture_frames import images
 from locate_rigs import located_pairs, pinhole_rig
@@ -125,8 +125,7 @@ def live(folder: Path) -> Iterator[Opened]:
 @contextmanager
 def verdict(folder: Path) -> Iterator[Opened]:
     """`kcal report` on a camera with its views."""
-    truth = camera("opencv5")
-    observe(pixels_of(truth, motions(truth, 14, 3), noise=0.05)).save(folder / "left.obs.json")
+    observe(corner_pixels(14, 3, noise=0.05)).save(folder / "left.obs.json")
     known, seen = folder / "left.camera.json", folder / "left.obs.json"
     run = CliRunner().invoke
     run(app, ["calibrate", str(seen), "-o", str(known), "--model", "opencv5"], catch_exceptions=False)

@@ -179,11 +179,8 @@ class TestFold:
         lens[5] = -0.25
         assert float(valid_region(lens, "opencv8").radius) == pytest.approx(2.0, abs=1e-12)
         camera = Camera.build(focal=(100, 100), center=(0, 0), size=(9, 9), coefficients=lens.tolist(), model="opencv8")
-        assert camera.project(torch.tensor([[1.99, 0, 1], [2.01, 0, 1], [9.0, 0, 1]]))[1].tolist() == [
-            True,
-            False,
-            False,
-        ]
+        _, valid = camera.project(torch.tensor([[1.99, 0, 1], [2.01, 0, 1], [9.0, 0, 1]]))
+        assert valid.tolist() == [True, False, False]
 
     def test_a_lens_without_a_valid_disc(self) -> None:
         # Tilted by more than 90° even the axis is behind the sensor; nothing is valid, and nothing fails.

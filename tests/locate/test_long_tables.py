@@ -192,23 +192,23 @@ def test_cells_of_further_columns_in_json(tmp_path: Path, cell: str, value: obje
     assert features[2]["properties"]["more"] == value
 
 
-def test_names_that_would_act_are_texts_and_come_back(tmp_path: Path) -> None:
-    names = ["=1+1", "@a", "-5", "-5 m", "a,b", 'say "x"', "semi;colon", "'quoted'"]
-    path = tmp_path / "points.csv"
+def with_names(path: Path, names: list[str]) -> Path:
     with path.open("w", newline="") as file:
         out = csv.writer(file)
         out.writerow(["name", "left_u", "left_v", "right_u", "right_v"])
         out.writerows([name, 960, 540, 950, 540] for name in names)
+    return path
+
+
+def test_names_that_would_act_are_texts_and_come_back(tmp_path: Path) -> None:
+    names = ["=1+1", "@a", "-5", "-5 m", "a,b", 'say "x"', "semi;colon", "'quoted'"]
+    path = with_names(tmp_path / "points.csv", names)
     assert [name for chunk, _ in read_mark_chunks(path) for name in chunk.names] == names
     text = written(".csv", path, 10).decode()
     column = [row["name"] for row in csv.DictReader(io.StringIO(text))]
     assert column[:4] == ["'=1+1", "'@a", "-5", "'-5 m"]
     # The same table as kcal wrote it, its marks put back.
-    again = tmp_path / "again.csv"
-    with again.open("w", newline="") as file:
-        out = csv.writer(file)
-        out.writerow(["name", "left_u", "left_v", "right_u", "right_v"])
-        out.writerows([name, 960, 540, 950, 540] for name in column)
+    again = with_names(tmp_path / "again.csv", column)
     assert [name for chunk, _ in read_mark_chunks(again) for name in chunk.names] == names
     # A name that begins as if it had been guarded is guarded once more.
     located = located_pairs(real_rig(), *pixels()[:1].unbind(1), names=["'=1"], origin=ORIGIN, heading_deg=0.0)

@@ -58,9 +58,15 @@ def survey(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_files_are_those_that_rig_and_locate_read(tmp_path: Path, survey: Path) -> None:
+@pytest.fixture
+def session(tmp_path: Path, survey: Path) -> Session:
+    """With two landmarks and one target with a matched mark."""
     session = Session(tmp_path / "marks.csv", survey)
     work(session)
+    return session
+
+
+def test_the_files_are_those_that_rig_and_locate_read(session: Session) -> None:
     marks = read_marks(session.files.marks, single=True)
     found = match_landmarks(read_survey(session.files.landmarks), marks, 0.1)
     assert found.landmarks.names == ("post", "roof")
@@ -124,9 +130,7 @@ def test_a_place_that_no_survey_has_is_refused(tmp_path: Path, survey: Path) -> 
     kept(session).close()
 
 
-def test_undo_to_the_beginning(tmp_path: Path, survey: Path) -> None:
-    session = Session(tmp_path / "marks.csv", survey)
-    work(session)
+def test_undo_to_the_beginning(session: Session) -> None:
     for step in range(6):
         session.do(Step(do="undo"), f"undo-{step:04d}")
     assert all(item.left is None and item.right is None for item in session.state.items.values())
@@ -143,9 +147,7 @@ def test_two_sessions_cannot_write_the_same_marks(tmp_path: Path) -> None:
     Session(tmp_path / "marks.csv").close()
 
 
-def test_marks_that_were_changed_outside_are_taken_over(tmp_path: Path, survey: Path) -> None:
-    session = Session(tmp_path / "marks.csv", survey)
-    work(session)
+def test_marks_that_were_changed_outside_are_taken_over(session: Session, tmp_path: Path, survey: Path) -> None:
     session.close()
     marks = read_marks(session.files.marks, single=True)
     write_marks(session.files.marks, Marks.of_pair(marks.names, marks.left + 1.0, marks.right, marks.covariance))
@@ -161,10 +163,8 @@ def test_marks_that_were_changed_outside_are_taken_over(tmp_path: Path, survey: 
 @pytest.mark.parametrize(
     "damaged", [b"nonsense", b"\0" * 40, b"[1, 2]", b"[" * 100_000, b'{"key": "k", "action": ' + b"9" * 5000 + b"}"]
 )
-def test_a_damaged_line_loses_itself_alone(tmp_path: Path, survey: Path, damaged: bytes) -> None:
+def test_a_damaged_line_loses_itself_alone(session: Session, tmp_path: Path, survey: Path, damaged: bytes) -> None:
     """Whatever stands in its place: noise, zeros, JSON of another kind, a nest, a number of 5,000 digits."""
-    session = Session(tmp_path / "marks.csv", survey)
-    work(session)
     state = session.state
     session.close()
     lines = session.files.log.read_bytes().splitlines(keepends=True)
@@ -222,10 +222,8 @@ class FullDisk:
 
 @pytest.mark.parametrize("left", [0, 1, 50, 10**9])
 def test_a_full_disk_loses_nothing_that_was_acknowledged(
-    tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch, left: int
+    session: Session, survey: Path, monkeypatch: pytest.MonkeyPatch, left: int
 ) -> None:
-    session = Session(tmp_path / "marks.csv", survey)
-    work(session)
     before, log, version = session.state, session.files.log.read_bytes(), session.version
     with monkeypatch.context() as patched:
         disk = FullDisk(patched, left)
@@ -242,10 +240,8 @@ def test_a_full_disk_loses_nothing_that_was_acknowledged(
 
 
 def test_nothing_is_left_where_even_cutting_off_fails(
-    tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch
+    session: Session, survey: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    session = Session(tmp_path / "marks.csv", survey)
-    work(session)
 
     def failing(*_: int) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
@@ -268,10 +264,8 @@ def test_nothing_is_left_where_even_cutting_off_fails(
 
 
 def test_tables_that_a_full_disk_did_not_take_are_written_later(
-    tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch
+    session: Session, tmp_path: Path, survey: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    session = Session(tmp_path / "marks.csv", survey)
-    work(session)
     old = session.files.marks.read_text()
 
     def full(path: Path, text: str) -> None:
@@ -296,12 +290,10 @@ def test_tables_that_a_full_disk_did_not_take_are_written_later(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the limit is one of POSIX")
-def test_a_limit_of_the_system_is_a_full_disk(tmp_path: Path, survey: Path) -> None:
+def test_a_limit_of_the_system_is_a_full_disk(session: Session, survey: Path) -> None:
     """As with `ulimit -f`: the kernel writes a part of a line and refuses the rest."""
     import resource
 
-    session = Session(tmp_path / "marks.csv", survey)
-    work(session)
     before = session.state
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (session.files.log.stat().st_size + 20, limits[1]))
@@ -326,18 +318,14 @@ def test_marks_of_a_target_are_of_one_moment(tmp_path: Path, survey: Path) -> No
     session.do(put("post", "right", mark(1, 2, frame="2")), "key-0005")
 
 
-def test_a_match_that_ends_keeps_its_whole_error(tmp_path: Path, survey: Path) -> None:
-    session = Session(tmp_path / "marks.csv", survey)
-    work(session)
+def test_a_match_that_ends_keeps_its_whole_error(session: Session) -> None:
     session.do(put("truck", "left", mark(50.0, 60.0, 0.02)), "key-0007")
     right = session.state.items["truck"].right
     assert right.cov[0] == pytest.approx(0.3**2 + 0.05**2)
     assert float(pair_covariance(session.state.items["truck"])[0, 2]) == 0.0
 
 
-def test_names_places_and_removals(tmp_path: Path, survey: Path) -> None:
-    session = Session(tmp_path / "marks.csv", survey)
-    work(session)
+def test_names_places_and_removals(session: Session) -> None:
     session.do(Rename(do="rename", name="post", to="hill, west", kind="landmark"), "key-0007")
     session.do(SurveyPlace(do="survey", name="well", place=Place(at=(40.15, -113.85, 1280.0), sigma=0.05)), "key-0008")
     session.do(Take(do="take", name="roof", side="left"), "key-0009")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Callable
 
 import pytest
 import torch
@@ -358,16 +357,12 @@ def answer(meters: float, **parts: float) -> RangeAnswer:
     return RangeAnswer(requirement=Requirement(distance=1000.0, meters=meters), parts=parts)
 
 
-@pytest.fixture
-def page() -> Callable[..., str]:
-    def make(*findings: Finding, subject: str = "left") -> str:
-        verdict = Verdict(subject=subject, answers=(answer(50.0, marks=30.0, lenses=20.0),), findings=findings)
-        return verdict_page(verdict, {}, [range_rows(verdict)])
-
-    return make
+def page(*findings: Finding, subject: str = "left") -> str:
+    verdict = Verdict(subject=subject, answers=(answer(50.0, marks=30.0, lenses=20.0),), findings=findings)
+    return verdict_page(verdict, {}, [range_rows(verdict)])
 
 
-def test_the_page_says_what_the_verdict_says(page: Callable[..., str]) -> None:
+def test_the_page_says_what_the_verdict_says() -> None:
     assert ">YES<" in page()
     assert "At 1 km the range is known to ±3.6 %; 5 % are required." in page()
     stop = Finding(name="blur", severity="stop", text="corners scatter by 2 px", action="hold still")
@@ -378,7 +373,7 @@ def test_the_page_says_what_the_verdict_says(page: Callable[..., str]) -> None:
     assert "36 m" in refused
 
 
-def test_texts_of_others_are_text_and_nothing_is_fetched(page: Callable[..., str]) -> None:
+def test_texts_of_others_are_text_and_nothing_is_fetched() -> None:
     nasty = '<script>alert("1")</script>\x1b[2J'
     made = page(Finding(name=nasty, severity="doubt", text=nasty, action=nasty), subject=nasty)
     assert "<script" not in made

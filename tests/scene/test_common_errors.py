@@ -31,19 +31,27 @@ def spread_places(step: float, sway: float) -> tuple[torch.Tensor, torch.Tensor]
     return left, RIG(ranges * RIG.left.unproject(left)[0])[0][:, 1]
 
 
+def judged(
+    places: list[tuple[torch.Tensor, torch.Tensor]],
+    shared: torch.Tensor,
+    own: float,
+    share: torch.Tensor,
+    draw: torch.Generator,
+) -> list[torch.Tensor]:
+    """Covariances (N, 2, 2) of the matches of each pair; the right marks err by what all share, and each by its own."""
+    noise = (own * torch.randn(right.shape, dtype=torch.float64, generator=draw) for _, right in places)
+    pixels = [torch.stack([left, right + shared + more], 1) for (left, right), more in zip(places, noise, strict=True)]
+    stated = [(SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(shared), 2, 2)] * len(places)
+    return with_common_errors([line_errors(RIG, one) for one in pixels], pixels, stated, [share] * len(places))
+
+
 def counted(pairs: int, *, step: float = 16.0, own: float = SIGMA, common: float = 0.0, sway: float = 0.0) -> float:
     """Stated over counted information of the matches of some pairs, each error with a part that all pairs share."""
     draw = torch.Generator().manual_seed(3)
     places = [spread_places(step, k * sway) for k in range(pairs)]
     left, right = places[0]
     shared = common * torch.randn(right.shape, dtype=torch.float64, generator=draw)
-    pixels = []
-    for left, right in places:
-        noise = own * torch.randn(right.shape, dtype=torch.float64, generator=draw)
-        pixels.append(torch.stack([left, right + shared + noise], 1))
-    stated = [(SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(left), 2, 2)] * pairs
-    lines = [line_errors(RIG, one) for one in pixels]
-    found = with_common_errors(lines, pixels, stated, [torch.zeros(len(left)).double()] * pairs)
+    found = judged(places, shared, own, torch.zeros(len(left)).double(), draw)
     return sum(float((SIGMA**2 / one[:, 1, 1]).sum()) for one in found) / len(left)
 
 
@@ -80,13 +88,7 @@ def test_what_fits_in_part_is_judged_by_itself() -> None:
     partly = torch.rand(len(left), generator=draw) < 0.5
     share = 0.8 - 0.2 * partly.double() + 0.01 * torch.rand(len(left), generator=draw)
     shared = torch.where(partly[:, None], 1.5 * SIGMA * torch.randn(right.shape, generator=draw), 0.0)
-    pixels = []
-    for _ in range(4):
-        noise = SIGMA * torch.randn(right.shape, dtype=torch.float64, generator=draw)
-        pixels.append(torch.stack([left, right + shared + noise], 1))
-    stated = [(SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(left), 2, 2)] * 4
-    lines = [line_errors(RIG, one) for one in pixels]
-    found = torch.stack(with_common_errors(lines, pixels, stated, [share] * 4))[..., 1, 1] / SIGMA**2
+    found = torch.stack(judged([(left, right)] * 4, shared, SIGMA, share, draw))[..., 1, 1] / SIGMA**2
     plain, edges = ((1.0 / found[:, which]).sum(0).mean() for which in (~partly, partly))
     # Four times the information of one; and that of one with the variance 1.5² + 1/4.
     assert float(plain) == pytest.approx(4.0, rel=0.15)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from calibrate_scenes import calibration_record, camera, motions, observe, pixels_of
+from calibrate_scenes import calibration_record, corner_pixels, observe
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
@@ -66,8 +66,7 @@ def test_a_setting_that_was_calibrated_is_that_camera() -> None:
 @pytest.mark.slow
 def test_beside_a_setting_nothing_jumps() -> None:
     """The general way, through a fit, gives the calibration as well: mean, covariance and entrance pupil."""
-    truth = camera("opencv4")
-    seen = observe(pixels_of(truth, motions(truth, 8, 1), noise=0.1, seed=1))
+    seen = observe(corner_pixels(8, 1, "opencv4", noise=0.1, seed=1))
     first = calibrate_camera(seen).camera
     cameras = [restated(first, focus=0.0)]
     for focus in (1.0, 2.0):

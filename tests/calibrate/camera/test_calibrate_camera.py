@@ -7,7 +7,7 @@ import itertools
 
 import pytest
 import torch
-from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
+from calibrate_scenes import BOARD, SIZE, camera, corner_pixels, motions, observe, pixels_of
 from torch import Tensor
 
 from kcal import Camera, DegenerateError, InputError
@@ -117,8 +117,7 @@ class TestNumbers:
     """What is reported about a noisy fit follows from its residuals."""
 
     def test_rms_and_residuals(self) -> None:
-        truth = camera()
-        pixels = pixels_of(truth, motions(truth, 8, 2), noise=0.3, seed=4)
+        pixels = corner_pixels(8, 2, noise=0.3, seed=4)
         pixels[2, 5:11] = torch.nan
         result = solve(pixels)
         rotation, translation = result.cam_from_board_rotation, result.cam_from_board_translation
@@ -134,8 +133,7 @@ class TestNumbers:
 
     @pytest.mark.slow
     def test_nested_models_never_end_higher(self) -> None:
-        truth = camera("opencv14")
-        pixels = pixels_of(truth, motions(truth, 8, 20), noise=0.2)
+        pixels = corner_pixels(8, 20, "opencv14", noise=0.2)
         rms = [solve(pixels, model).rms for model in ("opencv5", "opencv8", "opencv12", "opencv14")]
         # The last bits of a sum of squares.
         assert all(rich <= poor * (1 + 1e-12) for poor, rich in itertools.pairwise(rms)), rms
@@ -251,9 +249,8 @@ class TestDegenerate:
 
     @pytest.mark.parametrize("views", [1, 2])
     def test_too_few_views(self, views: int) -> None:
-        truth = camera()
         with pytest.raises(DegenerateError, match=rf"^{views} views? of the board: at least 3 at different tilts"):
-            solve(pixels_of(truth, motions(truth, views, 1)))
+            solve(corner_pixels(views, 1))
 
     @pytest.mark.slow
     @pytest.mark.parametrize(("model", "noise"), [("pinhole", 0.5), ("opencv5", 0.0)])
@@ -276,8 +273,7 @@ class TestDegenerate:
 
     def test_too_few_corners_in_a_view(self) -> None:
         """Such a view is left out, with a warning; the others give the camera that they give alone."""
-        truth = camera()
-        pixels = pixels_of(truth, motions(truth, 5, 1))
+        pixels = corner_pixels(5, 1)
         alone = solve(pixels[[0, 1, 2, 4]])
         for count in (5, 0):
             pixels[3, count:] = torch.nan
@@ -289,22 +285,19 @@ class TestDegenerate:
 
     def test_corners_on_one_line(self) -> None:
         """The pose of such a view is open, and would spoil all others."""
-        truth = camera()
-        pixels = pixels_of(truth, motions(truth, 5, 1), noise=0.1)
+        pixels = corner_pixels(5, 1, noise=0.1)
         pixels[3, [i for i in range(BOARD.corners) if i % 7]] = torch.nan
         assert "lie on one line" in _left_out(solve(pixels))["v03"]
 
     def test_too_few_corners_in_all(self) -> None:
-        truth = camera("opencv14")
-        pixels = pixels_of(truth, motions(truth, 3, 1))
+        pixels = corner_pixels(3, 1, "opencv14")
         keep = [0, 6, 35, 41, 20, 16]
         pixels[:, [i for i in range(BOARD.corners) if i not in keep]] = torch.nan
         with pytest.raises(DegenerateError, match="18 corners in 3 views cannot determine 36 parameters"):
             solve(pixels, "opencv14")
 
     def test_corners_in_one_point_and_edge_on(self) -> None:
-        truth = camera()
-        pixels = pixels_of(truth, motions(truth, 5, 1))
+        pixels = corner_pixels(5, 1)
         pixels[2] = 100.0
         assert _left_out(solve(pixels)) == {"v02": "its corners coincide, or the board is seen edge-on"}
         pixels[2, :, 0] = torch.linspace(50, 500, BOARD.corners).double()
@@ -313,8 +306,7 @@ class TestDegenerate:
 
 class TestWarnings:
     def test_one_bad_view_is_named(self) -> None:
-        truth = camera()
-        pixels = pixels_of(truth, motions(truth, 8, 2), noise=0.1)
+        pixels = corner_pixels(8, 2, noise=0.1)
         assert solve(pixels).warnings == ()
         pixels[5] += torch.randn(BOARD.corners, 2, generator=torch.Generator().manual_seed(3)).double()
         warnings = solve(pixels).warnings
@@ -322,8 +314,7 @@ class TestWarnings:
         assert warnings[0].startswith("view v05: RMS 1.")
 
     def test_high_rms(self) -> None:
-        truth = camera()
-        warnings = solve(pixels_of(truth, motions(truth, 10, 2), noise=1.0)).warnings
+        warnings = solve(corner_pixels(10, 2, noise=1.0)).warnings
         assert any("px is high" in text for text in warnings)
         assert not any("view v" in text for text in warnings)
 
@@ -338,8 +329,7 @@ class TestWarnings:
         assert "has no ray" in folded[0]
 
     def test_steps_run_out(self) -> None:
-        truth = camera()
-        pixels = pixels_of(truth, motions(truth, 8, 2), noise=0.1)
+        pixels = corner_pixels(8, 2, noise=0.1)
         result = solve(pixels, solver=LMOptions(max_iterations=1))
         assert result.status == SolverStatus.ITERATION_LIMIT
         assert any("iteration limit" in text for text in result.warnings)
@@ -356,16 +346,14 @@ class TestWarnings:
 
 
 def test_progress_is_told() -> None:
-    truth = camera("opencv8")
     told: list[str] = []
-    seen = observe(pixels_of(truth, motions(truth, 6, 2)))
+    seen = observe(corner_pixels(6, 2, "opencv8"))
     calibrate_camera(seen, CalibrationOptions(weak_prior=None, model="opencv8"), told.append)
     assert told == ["base projection", "opencv8"]
 
 
 def test_order_of_views_does_not_matter() -> None:
-    truth = camera()
-    pixels = pixels_of(truth, motions(truth, 7, 2), noise=0.2)
+    pixels = corner_pixels(7, 2, noise=0.2)
     a, b = solve(pixels), solve(pixels.flip(0))
     # Both stop where the cost is flat to 1e-12 of itself.
     assert far_apart(a.camera, b.camera) < 1e-4

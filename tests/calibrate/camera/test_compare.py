@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 import torch
-from calibrate_scenes import SIZE, camera, motions, observe, pixels_of
+from calibrate_scenes import SIZE, camera, corner_pixels, observe
 from lenses import HYBRID, strong
 from printed_boards import printed_views
 from typer.testing import CliRunner
@@ -167,8 +167,7 @@ def test_errors_of_differences() -> None:
 
 
 def test_all_that_is_known_is_in_the_file(tmp_path: Path) -> None:
-    truth = camera()
-    pixels = pixels_of(truth, motions(truth, 8, 2))
+    pixels = corner_pixels(8, 2)
     pixels = pixels + 0.1 * torch.randn(pixels.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
     pixels[2, 7] += 30.0
     seen = observe(pixels)
@@ -205,8 +204,7 @@ def test_all_that_is_known_is_in_the_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("options", [{"model": "opencv5"}, {"model": "opencv5", "board_warp": True}, {}])
 def test_how_the_board_deviates_is_kept_where_it_was_solved(tmp_path: Path, options: dict) -> None:
     """Of a warped board and of a printed one; a board that was taken as exact has nothing to keep."""
-    truth = camera()
-    pixels = pixels_of(truth, motions(truth, 8, 2))
+    pixels = corner_pixels(8, 2)
     seen = observe(pixels + 0.1 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(3)))
     result = calibrate_camera(seen, CalibrationOptions(**options))
     path = result.save(tmp_path / "a.camera.json")

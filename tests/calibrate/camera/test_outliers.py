@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
+from calibrate_scenes import BOARD, SIZE, camera, corner_pixels, motions, observe, pixels_of
 from torch import Tensor
 
 from kcal import Board, Camera, DegenerateError, InputError, detect
@@ -28,8 +28,7 @@ NOISE = 0.1
 
 
 def scene(count: int = 14, seed: int = 2) -> Tensor:
-    truth = camera()
-    return pixels_of(truth, motions(truth, count, 5), noise=NOISE, seed=seed)
+    return corner_pixels(count, 5, noise=NOISE, seed=seed)
 
 
 def spoil(pixels: Tensor, seed: int, share: float = 0.02) -> tuple[Tensor, set[tuple[int, int]]]:
@@ -514,8 +513,7 @@ def test_a_weak_prior_that_is_none_is_refused(value: float) -> None:
 
 
 def test_a_small_model_hardly_feels_the_weak_prior() -> None:
-    truth = camera()
-    seen = observe(pixels_of(truth, motions(truth, 12, 3), noise=0.2))
+    seen = observe(corner_pixels(12, 3, noise=0.2))
     with_prior, without = (
         calibrate_camera(seen, CalibrationOptions(model="opencv5", weak_prior=value)) for value in (0.3, None)
     )

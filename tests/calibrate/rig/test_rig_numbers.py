@@ -146,10 +146,8 @@ class TestStatistics:
         """Twenty measurements of each source that scatter ten times as much as they say."""
         nothing = Part("", torch.zeros(2, 2).double(), 0, None)
         scatter = 10.0 * torch.linspace(-1.5, 1.5, 20).double()
-        parts = []
-        for middle in (0.0, 4.0):
-            rows = torch.stack([torch.ones(20).double(), -(middle + scatter)], 1)
-            parts.append(Part("", rows.T @ rows, 20, None))
+        both = (torch.stack([torch.ones(20).double(), -(middle + scatter)], 1) for middle in (0.0, 4.0))
+        parts = [Part("", rows.T @ rows, 20, None) for rows in both]
         test = _test(parts, (0,), (0, 1), nothing)
         variance = 2.0 * float(scatter.square().sum()) / 38.0
         assert test.chi2 == pytest.approx(16.0 / (2.0 / 20.0) / variance)

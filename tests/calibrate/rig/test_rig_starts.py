@@ -283,11 +283,8 @@ class TestPlaces:
         marks = landmarks(count=3, cameras=2)
         start = Start(rotation=ROTATION[:2].clone(), center=CENTER[:2].clone())
         starts = _in_all_places(data(2, landmarks=marks), [start])
-        per_camera = []
-        for c in (0, 1):
-            _, center = poses_from_three(rays_to(marks.points, c), marks.points)
-            per_camera.append(int(center.isfinite().all(-1).sum()))
-        assert len(starts) == per_camera[0] * per_camera[1]
+        centers = [poses_from_three(rays_to(marks.points, c), marks.points)[1] for c in (0, 1)]
+        assert len(starts) == math.prod(int(center.isfinite().all(-1).sum()) for center in centers)
         for one in starts:
             for c in (0, 1):
                 seen = (marks.points - one.center[c]) @ one.rotation[c].T
