@@ -52,14 +52,10 @@ _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
 _HALF = 2  # pixels: Kalibr's window of cornerSubPix
 
 
-def charuco(refine: int = cv2.aruco.CORNER_REFINE_NONE, again: bool = False) -> Detector:
-    """`CharucoDetector`; with `again`, markers that were not read are looked for where the others put them."""
-
-    def find(image: NDArray[np.uint8], board: Board) -> Tensor:
-        places, numbers, _, _ = _charuco_detector(board, refine, again).detectBoard(image)
-        return _by_number(places, numbers, board)
-
-    return find
+def charuco(image: NDArray[np.uint8], board: Board) -> Tensor:
+    """`CharucoDetector`; markers that were not read are looked for where the others put them."""
+    places, numbers, _, _ = _charuco_detector(board, cv2.aruco.CORNER_REFINE_SUBPIX, True).detectBoard(image)
+    return _by_number(places, numbers, board)
 
 
 def charuco_of_apriltag(image: NDArray[np.uint8], board: Board) -> Tensor:
@@ -74,18 +70,14 @@ def charuco_of_apriltag(image: NDArray[np.uint8], board: Board) -> Tensor:
     return _by_number(places, found, board)
 
 
-def aruco_grid(refine: int) -> Detector:
+def aruco_grid(image: NDArray[np.uint8], board: Board) -> Tensor:
     """The tags of an AprilGrid by `ArucoDetector`."""
-
-    def find(image: NDArray[np.uint8], board: Board) -> Tensor:
-        options = cv2.aruco.DetectorParameters()
-        options.markerBorderBits, options.cornerRefinementMethod = TAG_BORDER, refine
-        found, numbers, _ = cv2.aruco.ArucoDetector(opencv_dictionary(TAGS), options).detectMarkers(image)
-        seen = [] if numbers is None else map(int, numbers.reshape(-1))
-        # OpenCV's dictionary has these tags turned by half a turn.
-        return _placed({n: np.roll(tag.reshape(4, 2), 2, 0) for n, tag in zip(seen, found, strict=True)}, board)
-
-    return find
+    options = cv2.aruco.DetectorParameters()
+    options.markerBorderBits, options.cornerRefinementMethod = TAG_BORDER, cv2.aruco.CORNER_REFINE_APRILTAG
+    found, numbers, _ = cv2.aruco.ArucoDetector(opencv_dictionary(TAGS), options).detectMarkers(image)
+    seen = [] if numbers is None else map(int, numbers.reshape(-1))
+    # OpenCV's dictionary has these tags turned by half a turn.
+    return _placed({n: np.roll(tag.reshape(4, 2), 2, 0) for n, tag in zip(seen, found, strict=True)}, board)
 
 
 def apriltag_grid(image: NDArray[np.uint8], board: Board) -> Tensor:
@@ -106,11 +98,9 @@ def kalibr_grid(image: NDArray[np.uint8], board: Board) -> Tensor:
 
 def apriltags(image: NDArray[np.uint8], border: int) -> Tags:
     """Tags of family 36h11: left upper, right upper, right lower and left lower corner of each."""
-    out = {}
-    for tag in _apriltag_detector(border).detect(image):
-        # From the left lower corner on; pixel centers lie at halves.
-        out[int(tag.tag_id)] = np.asarray(tag.corners[[3, 2, 1, 0]]) - 0.5
-    return out
+    found = _apriltag_detector(border).detect(image)
+    # From the left lower corner on; pixel centers lie at halves.
+    return {int(tag.tag_id): np.asarray(tag.corners[[3, 2, 1, 0]]) - 0.5 for tag in found}
 
 
 @functools.cache
@@ -177,9 +167,9 @@ def own(image: NDArray[np.uint8], board: Board) -> Tensor:
 
 CHARUCO: dict[str, Detector] = {
     "kcal": own,
-    "CharucoDetector, tryRefineMarkers, SUBPIX": charuco(cv2.aruco.CORNER_REFINE_SUBPIX, again=True),
+    "CharucoDetector, tryRefineMarkers, SUBPIX": charuco,
 }
-GRID: dict[str, Detector] = {"kcal": own, "ArucoDetector, APRILTAG": aruco_grid(cv2.aruco.CORNER_REFINE_APRILTAG)}
+GRID: dict[str, Detector] = {"kcal": own, "ArucoDetector, APRILTAG": aruco_grid}
 TAGGED: dict[str, Detector] = dict(CHARUCO)
 if HAS_APRILTAG:
     TAGGED["AprilTag, CharucoDetector"] = charuco_of_apriltag

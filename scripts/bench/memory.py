@@ -89,7 +89,6 @@ except KcalError as error:
     said = str(error).splitlines()[0]
 """
 _VIEWS = """
-import json
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from scripts.shared.views import observed
 import numpy as np
@@ -98,10 +97,8 @@ found = calibrate_camera(observed(np.load(folder / "views.npy").tolist()), optio
 said = f"RMS {found.rms:.4f} px; the noise is 0.2828"
 """
 _FLEET = """
-import dataclasses
 from kcal.calibrate.batch.jobs import BatchOptions, Calibrated, CameraJob, Detected
-from kcal.calibrate.batch.results import Results
-from kcal.calibrate.batch.results import Task
+from kcal.calibrate.batch.results import Results, Task
 from kcal.corners.board import Board
 from kcal.io.camera_file import CameraFile
 board = Board(columns=9, rows=6, square=0.03)
@@ -208,14 +205,8 @@ STEPS = {
     "detect": [Step("`detect`, megapixels, 9x6 board", _DETECT, _image, (1, 10, 100))],
     "fleet": [Step("what `kcal batch` keeps, cameras of 6 views", _FLEET, _fleet, (100, 1_000), (10_000,))],
     "views": [
-        Step(
-            "`calibrate_camera`, views, default lens",
-            _VIEWS.replace("MODEL", "default"),
-            _views,
-            (100, 1_000),
-            (10_000,),
-        ),
-        Step("`calibrate_camera`, views, opencv8", _VIEWS.replace("MODEL", "opencv8"), _views, (100, 1_000), (10_000,)),
+        Step(f"`calibrate_camera`, views, {lens}", _VIEWS.replace("MODEL", model), _views, (100, 1_000), (10_000,))
+        for lens, model in (("default lens", "default"), ("opencv8", "opencv8"))
     ],
 }
 

@@ -44,30 +44,24 @@ SPLITS = {"blocks20": "whole blocks of views", "evenodd": "every other view"}
 Fitter = Callable[[Observations, Tensor], tuple[Camera, Tensor]]
 
 
-def by_evidence(options: FitOptions | None = None) -> Fitter:
-    def fit(seen: Observations, weight: Tensor) -> tuple[Camera, Tensor]:
-        found = fit_hybrid(seen.board.points, seen.pixels(), seen.image_size, weight, options)
-        told = f"sigma {found.sigma:.3f} px, tempering {found.tempering:.2f}"
-        print(f"    {told}, {found.effective:.1f} effective parameters", flush=True)
-        return found.camera, found.board_points
-
-    return fit
+def by_evidence(seen: Observations, weight: Tensor, options: FitOptions | None = None) -> tuple[Camera, Tensor]:
+    found = fit_hybrid(seen.board.points, seen.pixels(), seen.image_size, weight, options)
+    told = f"sigma {found.sigma:.3f} px, tempering {found.tempering:.2f}"
+    print(f"    {told}, {found.effective:.1f} effective parameters", flush=True)
+    return found.camera, found.board_points
 
 
-def parametric(model: str, weak_prior: float | None) -> Fitter:
-    def fit(seen: Observations, weight: Tensor) -> tuple[Camera, Tensor]:
-        found = calibrate_camera(seen, CalibrationOptions(model=model, board_warp=True, weak_prior=weak_prior))
-        assert found.board_warp is not None
-        return found.camera, warped(seen, found.board_warp)
-
-    return fit
+def parametric(model: str, weak_prior: float | None, seen: Observations, weight: Tensor) -> tuple[Camera, Tensor]:
+    found = calibrate_camera(seen, CalibrationOptions(model=model, board_warp=True, weak_prior=weak_prior))
+    assert found.board_warp is not None
+    return found.camera, warped(seen, found.board_warp)
 
 
 MODELS: dict[str, Fitter] = {
-    "hybrid": by_evidence(),
-    "opencv5": parametric("opencv5", None),
-    "opencv14, weak prior": parametric("opencv14", 0.3),
-    "ext20, weak prior": parametric("ext20", 0.3),
+    "hybrid": by_evidence,
+    "opencv5": functools.partial(parametric, "opencv5", None),
+    "opencv14, weak prior": functools.partial(parametric, "opencv14", 0.3),
+    "ext20, weak prior": functools.partial(parametric, "ext20", 0.3),
 }
 
 
@@ -172,5 +166,5 @@ def fields(wide_folds: int = 5, stereo_folds: int = 13, kinds: tuple[str, ...] =
         cases[f"{side}, each view"] = seen, weight, parts[:stereo_folds]
     yield ["field", *cases, "CPU s, wide lens"]
     for kind in kinds:
-        found = [over_parts(by_evidence(KINDS[kind]), *case) for case in cases.values()]
+        found = [over_parts(functools.partial(by_evidence, options=KINDS[kind]), *case) for case in cases.values()]
         yield [kind, *(f"{error:.4f}" for error, _ in found), f"{found[0][1]:.1f}"]

@@ -21,7 +21,6 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -113,15 +112,6 @@ def _works(process: psutil.Process) -> bool:
     with contextlib.suppress(psutil.Error):
         return "spawn_main" in " ".join(process.cmdline())
     return False
-
-
-@contextlib.contextmanager
-def cluster(folder: Path, workers: int) -> Iterator[Cluster]:
-    started = Cluster(folder, workers)
-    try:
-        yield started
-    finally:
-        started.close()
 
 
 def batch(
@@ -230,17 +220,17 @@ def fleet(
         add("processes, undisturbed", folder / "whole", [whole], whole.seconds)
 
         before = children_seconds()
-        with cluster(folder, workers) as dask:
+        with contextlib.closing(Cluster(folder, workers)) as dask:
             run = batch(source, folder / "killed", *options, on=dask, every=every)
         add("Dask, workers killed", folder / "killed", [run], children_seconds() - before)
 
         before = children_seconds()
         half = len(names) * (views + 1) // 2
-        with cluster(folder, workers) as dask:
+        with contextlib.closing(Cluster(folder, workers)) as dask:
             first = batch(source, folder / "resumed", *options, on=dask, every=every, stop_after=half)
         assert first.code == 1, first
         assert "the same command" in first.said, first
-        with cluster(folder, workers) as dask:
+        with contextlib.closing(Cluster(folder, workers)) as dask:
             second = batch(source, folder / "resumed", *options, on=dask, every=every)
         add(
             "Dask, also its scheduler, then continued", folder / "resumed", [first, second], children_seconds() - before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import importlib
 import importlib.util
 import io
@@ -137,19 +138,16 @@ def _packed_inputs() -> bytes:
     return data.getvalue()
 
 
-def _mrcal_inputs(path: Path) -> None:
+def _with_inputs(path: Path, packed: bytes) -> None:
     content = {"lensmodel": "LENSMODEL_PINHOLE", "intrinsics": [300.0, 301.0, 159.5, 119.5], "extrinsics": [0.0] * 6,
-               "imagersize": [320, 240], "optimization_inputs": base64.b85encode(_packed_inputs())}  # fmt: skip
+               "imagersize": [320, 240], "optimization_inputs": base64.b85encode(packed)}  # fmt: skip
     path.write_text(repr(content))
 
 
 def _unpacked(path: Path) -> object:
     """Damage below the base 85, which damage of the text hardly ever reaches."""
     model = path.with_suffix(".cameramodel")
-    content = {"lensmodel": "LENSMODEL_PINHOLE", "intrinsics": [300.0, 301.0, 159.5, 119.5], "extrinsics": [0.0] * 6,
-               "imagersize": [320, 240],
-               "optimization_inputs": base64.b85encode(read_bytes(path, 2**26))}  # fmt: skip
-    model.write_text(repr(content))
+    _with_inputs(model, read_bytes(path, 2**26))
     return import_cameras(model)
 
 
@@ -162,7 +160,7 @@ _FOREIGN: dict[str, Reader] = {
         ("opencv", ".yml"), ("opencv", ".xml"), ("opencv", ".json"), ("ros", ".yaml"), ("kalibr", ".yaml"),
         ("mrcal", ".cameramodel"), ("colmap", ".txt"), ("colmap", ".bin"), ("nerfstudio", ".json"), ("matlab", ".mat"),
         ("opensfm", ".json"), ("toml", ".toml"), ("gtsam", ".json"))},
-    "mrcal inputs": Reader(import_cameras, ".cameramodel", _mrcal_inputs),
+    "mrcal inputs": Reader(import_cameras, ".cameramodel", lambda path: _with_inputs(path, _packed_inputs())),
     "packed inputs": Reader(_unpacked, ".npz", lambda path: path.write_bytes(_packed_inputs())),
     "prior .json": Reader(import_cameras, ".json", _prior),
     "prior .npz": Reader(import_cameras, ".npz", _prior),
@@ -234,22 +232,16 @@ def _journal(path: Path) -> Any:
     # It is repaired in place, which a later case must not see.
     own = path.with_suffix(".own")
     own.write_bytes(read_bytes(path))
-    journal = Journal(own)
-    try:
+    with contextlib.closing(Journal(own)) as journal:
         return journal.state
-    finally:
-        journal.close()
 
 
 def _live_journal(path: Path) -> Any:
     output = path.with_name("out.csv")
     output.write_bytes(b"x" * 100)
     read_bytes(path)  # a journal that is missing is begun
-    ledger = Ledger(path, [output])
-    try:
+    with contextlib.closing(Ledger(path, [output])) as ledger:
         return ledger.place, ledger.checkpoint_at, ledger.state
-    finally:
-        ledger.close()
 
 
 def _whole_journal(path: Path) -> None:

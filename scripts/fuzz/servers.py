@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import logging
+import logging.handlers
 import math
 import random
 import shutil
@@ -176,23 +176,17 @@ def marking(folder: Path) -> Prepared:
         with tempfile.TemporaryDirectory(dir=folder) as name:
             place = Path(name, "session")
             place.mkdir()
-            desk = Desk(pictures, Session(place / "marks.csv"))
-            try:
+            with contextlib.closing(Desk(pictures, Session(place / "marks.csv"))) as desk:
                 app = marking_app(desk, _TOKEN, (_HOST,))
                 for request in json.loads(case):
                     _check_answer(ask(app, loop, request), request)
                 assert ask(app, loop, _good("/api/state")).status == 200, "no state any more"
                 shutil.copytree(place, Path(name, "again"), ignore=shutil.ignore_patterns("*.lock"))
                 before = desk.session.state
-            finally:
-                desk.close()
             files = sorted(path.name for path in place.iterdir())
             assert all(file.startswith(("marks", "points", "landmarks")) for file in files), f"files: {files}"
-            again = Session(Path(name, "again", "marks.csv"))
-            try:
+            with contextlib.closing(Session(Path(name, "again", "marks.csv"))) as again:
                 assert again.state == before, f"opened again: {again.state} | {before}"
-            finally:
-                again.close()
             for path in (desk.session.files.marks, desk.session.files.points):
                 if path.exists() and path.read_text(encoding="utf-8").count("\n") > 1:
                     read_marks(path, single=True)
@@ -214,22 +208,12 @@ def capture(folder: Path) -> Prepared:
     return Prepared(_requests(), check)
 
 
-class _Errors(logging.Handler):
-    """What a server wrote into its log as an error."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.ERROR)
-        self.texts: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.texts.append(self.format(record))
-
-
 def live_map(folder: Path) -> Prepared:
     """Raw bytes to the socket of a live map."""
     live = LiveMap(PointLocator(Localizer(placed_rig())).located(), 0)
     parts = urlsplit(live.address)
-    errors = _Errors()
+    errors = logging.handlers.BufferingHandler(1 << 20)
+    errors.setLevel(logging.ERROR)
     logging.getLogger("uvicorn.error").addHandler(errors)
     # With the words HOST and TOKEN, so that a case can be repeated.
     whole = [
@@ -262,11 +246,11 @@ def live_map(folder: Path) -> Prepared:
         return found
 
     def check(case: bytes) -> None:
-        errors.texts.clear()
+        errors.flush()
         found = said(case, ends=True)
         assert not found or (found.startswith(b"HTTP/1.1 ") and found[9:10] in b"1234"), f"answered {found[:100]!r}"
         assert b"root:" not in found, "a file from outside"
-        assert not errors.texts, f"in the log: {errors.texts[0][:300]}"
+        assert not errors.buffer, f"in the log: {errors.format(errors.buffer[0])[:300]}"
         assert said(whole[0], ends=False).startswith(b"HTTP/1.1 200"), "the page is not served any more"
 
     return Prepared(cases(), check)

@@ -121,39 +121,35 @@ def bound(scene: DemoScene) -> list[float]:
     return range_sigma(scene.rig, scene.points_rig(scene.targets), MARK_SIGMA).tolist()
 
 
-def by_kcal(cameras: tuple[Camera, Camera]) -> Orient:
+def by_kcal(cameras: tuple[Camera, Camera], points: Tensor, left: Tensor, right: Tensor) -> Rig:
     """`solve_rig` on the landmarks, and `Localizer`."""
+    landmarks = landmarks_of(points, torch.stack([left, right], 1), SURVEY_SIGMA, MARK_SIGMA)
+    try:
+        # Nothing is left out: a lens model that contradicts the landmarks is to show it.
+        # The simulated light goes straight.
+        options = RigOptions(reject=False, refraction=0.0, refraction_sigma=0.0)
+        solved = solve_rig(RigData(cameras=cameras, names=SIDES, landmarks=landmarks), options)
+    except (KcalError, RuntimeError):
+        return lost
+    rig = solved.stereo()
+    locate = Localizer(rig, pixel_sigma=MARK_SIGMA)
 
-    def orient(points: Tensor, left: Tensor, right: Tensor) -> Rig:
-        landmarks = landmarks_of(points, torch.stack([left, right], 1), SURVEY_SIGMA, MARK_SIGMA)
-        try:
-            # Nothing is left out: a lens model that contradicts the landmarks is to show it.
-            # The simulated light goes straight.
-            options = RigOptions(reject=False, refraction=0.0, refraction_sigma=0.0)
-            solved = solve_rig(RigData(cameras=cameras, names=SIDES, landmarks=landmarks), options)
-        except (KcalError, RuntimeError):
-            return lost
-        rig = solved.stereo()
-        locate = Localizer(rig, pixel_sigma=MARK_SIGMA)
+    def place(left: Tensor, right: Tensor) -> Tensor:
+        found = locate(left, right)
+        # Also where the parallax is below three sigma.
+        known = (found.inverse_range > 0)[..., None]
+        points = found.bearing / torch.where(known, found.inverse_range[..., None], 1.0)
+        return torch.where(known, points @ solved.rotation[0] + solved.center[0], torch.nan)
 
-        def place(left: Tensor, right: Tensor) -> Tensor:
-            found = locate(left, right)
-            # Also where the parallax is below three sigma.
-            known = (found.inverse_range > 0)[..., None]
-            points = found.bearing / torch.where(known, found.inverse_range[..., None], 1.0)
-            return torch.where(known, points @ solved.rotation[0] + solved.center[0], torch.nan)
+    def project(enu: Tensor) -> tuple[Tensor, Tensor]:
+        # By the lenses, not the rig: a pixel outside the image is one too.
+        points = (enu - solved.center[0]) @ solved.rotation[0].T
+        left, known = rig.left.project(points)
+        right, also = rig.right.project(rig.right_from_left(points))
+        valid = (known & also)[:, None]
+        return torch.where(valid, left, torch.nan), torch.where(valid, right, torch.nan)
 
-        def project(enu: Tensor) -> tuple[Tensor, Tensor]:
-            # By the lenses, not the rig: a pixel outside the image is one too.
-            points = (enu - solved.center[0]) @ solved.rotation[0].T
-            left, known = rig.left.project(points)
-            right, also = rig.right.project(rig.right_from_left(points))
-            valid = (known & also)[:, None]
-            return torch.where(valid, left, torch.nan), torch.where(valid, right, torch.nan)
-
-        return place, project
-
-    return orient
+    return place, project
 
 
 # A rig that could not be solved locates nothing.
@@ -168,35 +164,34 @@ def dense(pixels: Tensor) -> Any:
     return np.ascontiguousarray(pixels.numpy())
 
 
-def by_opencv(cameras: dict[str, tuple[Any, Any]]) -> Orient:
+def by_opencv(cameras: dict[str, tuple[Any, Any]], points: Tensor, left: Tensor, right: Tensor) -> Rig:
     """`solvePnP` on the landmarks, `undistortPoints` and `triangulatePoints`, as a user of OpenCV would.
 
     Args:
         cameras: matrix and distortion of both sides.
+        points: of landmarks.
+        left: their pixels in the left image.
+        right: and in the right one.
     """
+    surveyed, poses = points.numpy(), {}
+    for side, pixels in zip(SIDES, (left, right), strict=True):
+        (matrix, lens), marks = cameras[side], dense(pixels)
+        _, turn, shift = cv2.solvePnP(surveyed, marks, matrix, lens, flags=cv2.SOLVEPNP_SQPNP)
+        poses[side] = cv2.solvePnPRefineLM(surveyed, marks, matrix, lens, turn, shift)
+    projections = [np.hstack([cv2.Rodrigues(turn)[0], shift]) for turn, shift in poses.values()]
 
-    def orient(points: Tensor, left: Tensor, right: Tensor) -> Rig:
-        surveyed, poses = points.numpy(), {}
-        for side, pixels in zip(SIDES, (left, right), strict=True):
-            (matrix, lens), marks = cameras[side], dense(pixels)
-            _, turn, shift = cv2.solvePnP(surveyed, marks, matrix, lens, flags=cv2.SOLVEPNP_SQPNP)
-            poses[side] = cv2.solvePnPRefineLM(surveyed, marks, matrix, lens, turn, shift)
-        projections = [np.hstack([cv2.Rodrigues(turn)[0], shift]) for turn, shift in poses.values()]
+    def place(left: Tensor, right: Tensor) -> Tensor:
+        plane = [
+            cv2.undistortPoints(dense(pixels.reshape(-1, 1, 2)), *cameras[side])[:, 0].T
+            for side, pixels in zip(SIDES, (left, right), strict=True)
+        ]
+        homogeneous = cv2.triangulatePoints(projections[0], projections[1], plane[0], plane[1])
+        enu = (homogeneous[:3] / homogeneous[3]).T
+        ahead = enu @ projections[0][2, :3] + projections[0][2, 3] > 0
+        return torch.from_numpy(np.where(ahead[:, None], enu, NAN)).reshape(*left.shape[:-1], 3)
 
-        def place(left: Tensor, right: Tensor) -> Tensor:
-            plane = [
-                cv2.undistortPoints(dense(pixels.reshape(-1, 1, 2)), *cameras[side])[:, 0].T
-                for side, pixels in zip(SIDES, (left, right), strict=True)
-            ]
-            homogeneous = cv2.triangulatePoints(projections[0], projections[1], plane[0], plane[1])
-            enu = (homogeneous[:3] / homogeneous[3]).T
-            ahead = enu @ projections[0][2, :3] + projections[0][2, 3] > 0
-            return torch.from_numpy(np.where(ahead[:, None], enu, NAN)).reshape(*left.shape[:-1], 3)
+    def project(enu: Tensor) -> tuple[Tensor, Tensor]:
+        pixels = [cv2.projectPoints(enu.numpy(), *poses[side], *cameras[side])[0][:, 0] for side in SIDES]
+        return torch.from_numpy(pixels[0]), torch.from_numpy(pixels[1])
 
-        def project(enu: Tensor) -> tuple[Tensor, Tensor]:
-            pixels = [cv2.projectPoints(enu.numpy(), *poses[side], *cameras[side])[0][:, 0] for side in SIDES]
-            return torch.from_numpy(pixels[0]), torch.from_numpy(pixels[1])
-
-        return place, project
-
-    return orient
+    return place, project

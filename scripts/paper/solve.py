@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Collection
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ class _Run:
         # Their lenses with kcal's rig and rays tell what of the difference is not lenses.
         self._locate("OpenCV, kcal's rig", pair)
         self.result["cameras"]["OpenCV"] = self.result["cameras"]["OpenCV, kcal's rig"]
-        self.result["located"]["OpenCV"] = judge(self.scene, by_opencv(raw))
+        self.result["located"]["OpenCV"] = judge(self.scene, partial(by_opencv, raw))
         self._keep()
 
     def _locate(self, label: str, pair: Pair | None) -> None:
@@ -108,7 +109,7 @@ class _Run:
                 for side, lens in self.true.items()
             }
             cameras = pair["left"][0], pair["right"][0]
-            self.result["located"][label] = judge(self.scene, by_kcal(cameras))
+            self.result["located"][label] = judge(self.scene, partial(by_kcal, cameras))
         self._keep()
 
     def _keep(self) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -271,15 +271,11 @@ def _patterned(
     return pattern
 
 
-def _ground_pixel(focal: float) -> Callable[[Cut], tuple[Floats, Floats]]:
+def _ground_pixel(focal: float, at: Cut) -> tuple[Floats, Floats]:
     """Meters of a pixel on the level ground ahead and across, longer first."""
-
-    def pixel(at: Cut) -> tuple[Floats, Floats]:
-        across = np.maximum(at.up, 1.0) / focal
-        ahead = across * np.maximum(at.up, 1.0) / EYE_HEIGHT
-        return np.maximum(across, ahead), np.minimum(across, ahead)
-
-    return pixel
+    across = np.maximum(at.up, 1.0) / focal
+    ahead = across * np.maximum(at.up, 1.0) / EYE_HEIGHT
+    return np.maximum(across, ahead), np.minimum(across, ahead)
 
 
 def _pieces(seed: int, weather: Weather, focal: float) -> list[Facet]:
@@ -290,13 +286,14 @@ def _pieces(seed: int, weather: Weather, focal: float) -> list[Facet]:
     ground = Facet(
         origin=np.array([0.0, 0.0, -EYE_HEIGHT]), along=right, up=ahead, color=(105.0,),
         outline=box_outline((-2.0 * _FARTHEST, 5.0, 2.0 * _FARTHEST, _FARTHEST)),
-        pattern=_patterned(seed, waves, _brightness(weather), weather.season, _ground_pixel(focal)),
+        pattern=_patterned(seed, waves, _brightness(weather), weather.season, functools.partial(_ground_pixel, focal)),
     )  # fmt: skip
     hills, blocks = [], []
     for distance, top in _HILLS:
         offset, gray = float(random.uniform(0, 99)), float(random.uniform(80, 130))
         outline = box_outline((-2 * distance, -EYE_HEIGHT, 2 * distance, top + 0.1 * distance))
-        hill = facing(np.array([0.0, distance, 0.0]), outline, (gray,), top=_skyline(top, distance, offset))
+        edge = functools.partial(_skyline, top, distance, offset)
+        hill = facing(np.array([0.0, distance, 0.0]), outline, (gray,), top=edge)
         hills.append(_textured(hill, offset, weather, weather.season, focal))
     for distance in np.geomspace(50.0, 2500.0, 48):
         side, width = float(distance * random.uniform(-0.6, 0.6)), float(distance * random.uniform(0.015, 0.05))
@@ -318,12 +315,9 @@ def _vehicles(random: np.random.Generator, weather: Weather, focal: float) -> li
     return found
 
 
-def _skyline(top: float, distance: float, offset: float) -> Callable[[Floats], Floats]:
-    def edge(along: Floats) -> Floats:
-        rough: Floats = top + 0.016 * distance * smooth_noise(along / (0.06 * distance) + offset, 0.0 * along, 4)
-        return rough
-
-    return edge
+def _skyline(top: float, distance: float, offset: float, along: Floats) -> Floats:
+    rough: Floats = top + 0.016 * distance * smooth_noise(along / (0.06 * distance) + offset, 0.0 * along, 4)
+    return rough
 
 
 def _textured(facet: Facet, offset: float, weather: Weather, season: float, focal: float) -> Facet:
@@ -332,10 +326,7 @@ def _textured(facet: Facet, offset: float, weather: Weather, season: float, foca
     waves = tuple(distance / 1500.0 * wide for wide in (5.0, 9.0, 17.0, 40.0))
     light = _lit(np.cross(facet.along, facet.up), weather)
     pattern = _patterned(offset, waves, light, season, lambda _: (distance / focal,) * 2)
-    return Facet(
-        origin=facet.origin, along=facet.along, up=facet.up, outline=facet.outline, color=facet.color, top=facet.top,
-        pattern=pattern,
-    )  # fmt: skip
+    return replace(facet, pattern=pattern)
 
 
 def _shadow(block: Facet, weather: Weather) -> Facet | None:

@@ -48,12 +48,10 @@ def captures(
     seen, valid = lens.project(points @ found.rotation.transpose(-1, -2) + found.translation[:, None])
     # Poses that another lens drew may reach beyond this one's image.
     valid &= ((seen > -0.5) & (seen < seen.new_tensor(lens.size) - 0.5)).all(-1)
-    out = []
-    for k, sigma in enumerate(sigmas):
-        # Noise of other corners is other noise.
-        noise = (found.pixels - found.true_pixels).roll(k, 1)
-        out.append(as_observations(torch.where(valid[..., None], seen + sigma * noise, torch.nan), lens.size))
-    return out
+    noise = found.pixels - found.true_pixels
+    # Noise of other corners is other noise.
+    noisy = (seen + sigma * noise.roll(k, 1) for k, sigma in enumerate(sigmas))
+    return [as_observations(torch.where(valid[..., None], pixels, torch.nan), lens.size) for pixels in noisy]
 
 
 def as_observations(
