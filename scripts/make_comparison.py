@@ -97,7 +97,7 @@ def by_opencv(scene: DemoScene, seen: tuple[Observations, Observations], survey:
     """Positions (N, 3) of the targets by `calibrateCamera`, `solvePnP` and `triangulatePoints`."""
     cameras = {side: calibrated(views, count)[1:] for side, views in zip(SIDES, seen, strict=True)}
     marks = scene.landmark_marks
-    place, _ = opencv_rig(cameras)(survey.enu, marks.left, marks.right)
+    place, _ = opencv_rig(cameras, survey.enu, marks.left, marks.right)
     return place(scene.target_marks.true_left, scene.target_marks.true_right)
 
 
