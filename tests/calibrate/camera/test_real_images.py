@@ -12,6 +12,7 @@ import torch
 from kcal import Board, Camera, Observations, RigOptions, calibrate_rig, detect
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.rig.result import RigResult
+from kcal.lens import camera_difference
 from kcal.report.judge_rig import triangulated_sides
 from kcal.rig import pair_by_name
 
@@ -183,3 +184,12 @@ def test_a_lens_seen_in_a_ring_alone_is_solved_to_the_end(kcal_data: Path) -> No
     assert float(found.camera.focal[0] / found.hybrid.families.mean[0]) < 1.7
     # σ is of corners along an axis, wider where residuals repeat within views.
     assert found.rms / 2**0.5 < found.hybrid.sigma < 2.0 * found.rms
+
+
+def test_four_views_of_a_stranger(kcal_data: Path) -> None:
+    """Two focal lengths led them astray: no lens showed all corners."""
+    seen = Observations.load(kcal_data / "captures" / "gavin_r.obs.json")
+    few = [f"chessboard-R{number}.png" for number in (15, 8, 5, 14)]
+    rest = [name for name in seen.names if name not in few]
+    found, others = (calibrate_camera(seen.subset(names)).camera for names in (few, rest))
+    assert camera_difference(found, others).same
