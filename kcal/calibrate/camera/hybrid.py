@@ -205,6 +205,8 @@ def hybrid_result(observations: Observations, fit: HybridFit, options: Calibrati
 _FAILED = (InputError, ArithmeticError, torch.linalg.LinAlgError)
 # Largest share of the views that is left out without being asked.
 _FEW = 0.2
+# Views that must be left: fewer fit one another whatever is wrong with one of them, and another one is blamed for it.
+_ENOUGH = 5
 # How many times larger or smaller a focal length is that was given wrongly.
 _FAR = 1.5
 # What was not used concerns the views, not the fit, and stays with another fit of the same views.
@@ -220,7 +222,7 @@ def calibrate_what_fits(
 
     Raises:
         DegenerateError: as `calibrate_hybrid`, with the names of the views.
-        InputError: more than a fifth of the views do not fit, or the only one of four; the message names them. Or no
+        InputError: more than a fifth of the views do not fit, or one of five or fewer; the message names them. Or no
             hand moves as views do while they are read.
     """
     # What these refuse, leaving out views does not mend.
@@ -276,8 +278,7 @@ def calibrate_what_fits(
 
 def few_views(wrong: int, count: int) -> bool:
     """Whether so many of `count` views are few enough to go on without them."""
-    # Three fit one another whatever is wrong with one of them.
-    return wrong <= max(1.0, _FEW * count) and count - wrong > MINIMUM_VIEWS
+    return wrong <= max(1.0, _FEW * count) and count - wrong >= _ENOUGH
 
 
 def _without(
