@@ -12,8 +12,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import kcal
-from kcal.cli import console, kinds, rooms
-from kcal.cli.console import aligned, draw_picture, ending_with, followed, look_at_views, mark_again, steps, warn
+from kcal.cli import kinds, rooms
+from kcal.cli.console import (
+    aligned,
+    draw_picture,
+    ending_with,
+    followed,
+    look_at_views,
+    mark_again,
+    steps,
+    warn,
+    with_command,
+)
 from kcal.cli.inputs import pixel_sigma_and_source, typed_with
 from kcal.cli.options import Kind, Rare, Several
 from kcal.cli.stars import Night
@@ -186,7 +196,10 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     warn(*(f"{text}; left out" for text in refused))
     features, counts = rooms.scene_of((first, second), pairs, found)
     rows: list[tuple[str, ...]] = [("scene", "matched", "no texture", "off the line", "moved", "thinned", "used")]
-    rows += [tuple(map(str, dataclasses.astuple(one))) for one in counts]
+    rows += [
+        (one.name, *map(str, (one.matched, one.untextured, one.off_line, one.moved, one.thinned, one.used)))
+        for one in counts
+    ]
     read.notes += aligned(rows)
     if alone := sum(len(rooms.expand_images(one)) for one in given) - 2 * len(chosen):
         read.notes.append(f"{counted_text(alone, 'image')} of the scene without partner")
@@ -607,7 +620,7 @@ def read_sources(
     """Read everything; warnings about it are printed. Two cameras are left and right, one or more have their names."""
     if (sources.landmarks is None) != (sources.marks is None):
         text = "--landmarks and --marks belong together: places by name, and where they are in the images"
-        raise InputError(console.with_command(text, _cure_of("marks", sources, paths)))
+        raise InputError(with_command(text, _cure_of("marks", sources, paths)))
     if sources.terrain is None and (sources.skyline or sources.skyline_picture is not None):
         raise InputError("--skyline and --skyline-picture need the raster of the terrain: --terrain DEM.tif")
     known = CAMERAS if len(cameras) == 2 else names
