@@ -260,12 +260,12 @@ class TestAnswers:
         for left, right, worst in ((3.0, 2.0, 3.0), (0.5, 0.4, 1.0), (0.5, 2.0, 2.0), (math.nan, 2.0, math.nan)):
             asked.clear()
             totals.update({0.5 * 1920 - 0.3 * 1920: left, 0.5 * 1920 + 0.3 * 1920: right})
-            found = float(_worst_of_pair(rig, 1000.0, 0.3).total)
+            found = float(_worst_of_pair(rig, 1000.0, pixel_sigma=0.3).total)
             assert found == pytest.approx(worst, nan_ok=True)
             assert [None if place is None else place[0] for place in asked] == [None, *places]
             assert asked[1][1] == 540
         totals.clear()
-        assert float(_worst_of_pair(rig, 1000.0, 0.3).total) == 1.0
+        assert float(_worst_of_pair(rig, 1000.0, pixel_sigma=0.3).total) == 1.0
 
     def test_stations_have_names(self) -> None:
         result = landmarks_rig()
