@@ -151,8 +151,11 @@ def print_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> 
 def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
     """A line for each row, in columns that are as wide as they need to be; see `print_table`."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    form = "  ".join(f"{{:{'<' if i in left else '>'}{width}}}" for i, width in enumerate(widths))
-    return [form.format(*row).rstrip() for row in rows]
+    lines = []
+    for row in rows:
+        cells = zip(row, widths, strict=True)
+        lines.append("  ".join(cell.ljust(w) if i in left else cell.rjust(w) for i, (cell, w) in enumerate(cells)))
+    return [line.rstrip() for line in lines]
 
 
 def tell_table(name: str, table: Table, left: Collection[int] = (0,)) -> None:

@@ -282,8 +282,10 @@ def next_step(folder: Path) -> Exercise | None:
     """The first step whose files are not all there; what only leads to a step that is done counts as done."""
     others = {"positions.geojson": POSITIONS, "tracks.csv": TRACKS}
     done = [all(_first(folder, others.get(made, (made,))) for made in step.makes) for step in STEPS]
-    each = zip(STEPS, done, [*done[1:], False], strict=True)
-    return next((step for step, own, later in each if not (own or (step.leads_on and later))), None)
+    for step, own, later in zip(STEPS, done, [*done[1:], False], strict=True):
+        if not own and not (step.leads_on and later):
+            return step
+    return None
 
 
 def _show(name: str, what: str, table: Table | None) -> None:

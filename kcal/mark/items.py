@@ -223,7 +223,7 @@ def applied(state: MarkingState, action: Change) -> MarkingState:
     elif isinstance(action, Put):
         items[action.name] = _with_mark(action, items[action.name])
     elif isinstance(action, Take):
-        items[action.name] = Item(**vars(_unmatched(items[action.name])) | {action.side: None})
+        items[action.name] = _item_with(_unmatched(items[action.name]), action.side, None)
     elif isinstance(action, Drop):
         del items[action.name]
     else:
@@ -252,7 +252,7 @@ def _with_mark(action: Put, item: Item) -> Item:
     if action.matched and far is None:
         raise InputError(f"{action.name} has no mark in the other image to be matched with")
     cross = other_side(action.side) if action.matched else None
-    return Item(**vars(_unmatched(item)) | {action.side: _known_to(action), "cross": cross})
+    return dataclasses.replace(_item_with(_unmatched(item), action.side, _known_to(action)), cross=cross)
 
 
 def _known_to(action: Put) -> Mark:
@@ -264,10 +264,16 @@ def _known_to(action: Put) -> Mark:
     return action.mark.model_copy(update={"cov": (least**2, 0.0, least**2)})
 
 
+def _item_with(item: Item, side: Side, mark: Mark | None) -> Item:
+    return dataclasses.replace(item, left=mark) if side == "left" else dataclasses.replace(item, right=mark)
+
+
 def _unmatched(item: Item) -> Item:
     """The item with marks that stand alone: a matched one has the other's error besides its own."""
     if item.cross is None or item.left is None or item.right is None:
         return item
     total = tuple(a + b for a, b in zip(item.left.cov, item.right.cov, strict=True))
     side = other_side(item.cross)
-    return Item(**vars(item) | {side: getattr(item, side).model_copy(update={"cov": total}), "cross": None})
+    mark = item.mark(side)
+    assert mark is not None
+    return dataclasses.replace(_item_with(item, side, mark.model_copy(update={"cov": total})), cross=None)

@@ -66,8 +66,10 @@ def view_findings(result: CameraCalibrationResult, noise: float | None = None) -
 
 def record_findings(record: CalibrationRecord) -> list[Finding]:
     """What the record of a calibration tells of its views, where these themselves are not at hand."""
-    sides, blur = _sides_finding(tuple(record.per_view_rms), "stop"), _blur_finding(record.noise or 0.0, 0.0)
-    found = [sides, blur, _few_finding(record.views), *record.findings]
+    found = [_sides_finding(tuple(record.per_view_rms), "stop")]
+    if record.noise is not None:
+        found.append(_blur_finding(record.noise, 0.0))
+    found += [_few_finding(record.views), *record.findings]
     return [finding for finding in found if finding is not None]
 
 

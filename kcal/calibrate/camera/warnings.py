@@ -45,6 +45,12 @@ def motion_findings(fit: HybridFit) -> list[Finding]:
     """A doubt where the camera or the board moved while an image was read, with how much that moved corners."""
     if fit.motion_sigma is None or fit.readout is None:
         return []
+    if moves_beyond_hands(fit):
+        text = (
+            "while an image is read, views move by more than any hand does: these motions stand for something else "
+            "(wrong corners, a board that bends, a cropped or stabilized video), and error bars may be far too small"
+        )
+        return [Finding("motion", "doubt", text, "look at the views that fit worst, and photograph a board on a stand")]
     lines = "column" if fit.readout.columns else "row"
     moved = fit.motion_sigma.moved(float(fit.state.parameters[0]), fit.readout.reach(fit.board_points))
     if moved < FELT * fit.sigma:

@@ -321,7 +321,7 @@ def settle(
         elif one.square or not rough:
             rounds = run(one, near, rounds.steps)
             if one.square and capture.hyperprior.by_hand:
-                # Few views can lead two focal lengths astray, and one that begins there stays there.
+                # Two focal lengths can end far off where views are few, and square pixels that begin there stay there.
                 rounds = min(rounds, begin(one), key=lambda each: each.untempered_loss)
             # Motion along columns and the aspect of pixels look alike: with square pixels it may explain what the
             # aspect did, and that is no more than the nats that the aspect was worth.

@@ -58,6 +58,8 @@ def test_motion_is_told_in_pixels() -> None:
     at_limit = dataclasses.replace(fit, log_ratio=np.where(np.arange(4) == 1, log_ratio, fit.log_ratio))
     near = dataclasses.replace(at_limit, readout=dataclasses.replace(fit.readout, distance=0.1))
     assert [moves_beyond_hands(one) for one in (fit, at_limit, near)] == [False, True, False]
+    assert "views move by more than any hand does" in sentences(motion_findings(at_limit))[0]
+    assert "moved while rows were read" in sentences(motion_findings(near))[0]
     assert motion_findings(fitted(12, None)) == []
 
 
