@@ -260,7 +260,7 @@ class Adjustment:
             # Where there is nothing but boards, they determine the shared unknowns too.
             alone = len(problem.blocks) == 1 and not self.terms
             free = problem.shared_size - int(self.unknowns.known.sum())
-            ratio = float(squares.sum()) / max(dof - alone * free, 1)
+            ratio = self.widened["boards"] ** 2 * float(squares.sum()) / max(dof - alone * free, 1)
         if 0 < ratio < math.inf:
             self.sigma_corner = max(self.sigma_corner * math.sqrt(ratio), _LEAST_SIGMA)
         return abs(self.sigma_corner / before - 1.0)

@@ -446,6 +446,8 @@ def _other_places(work: Adjustment, mask: Tensor) -> Iterator[RigState]:
 
 # Of fewer boards alone, a wrong one cannot be told from a good one.
 _FEW_BOARDS = 3
+# Boards alone that must be left: fewer fit one another whatever is wrong with one of them, and another one is blamed.
+_ENOUGH_BOARDS = 5
 # px: a higher RMS is not noise.
 _HIGH_RMS = 1.0
 
@@ -516,9 +518,15 @@ def rig_result(
     def doubt(name: str, text: str, action: str = "") -> None:
         findings.append(Finding(name, "doubt", text, action))
 
-    only_boards = len(problem.blocks) == 1 and problem.blocks[0].many
-    if only_boards and (count := int(mask.sum())) < _FEW_BOARDS:
+    only_boards, count = len(problem.blocks) == 1 and problem.blocks[0].many, int(mask.sum())
+    if only_boards and count < _FEW_BOARDS:
         doubt("pairs", f"{counted_text(count, 'pair')} only: a wrong one could not be noticed", "5 or more are good")
+    against_them = [name for i, name in enumerate(work.labels) if not mask[i] and i not in reasons]
+    if only_boards and refuse and against_them and count < _ENOUGH_BOARDS:
+        raise InputError(
+            f"{' and '.join(against_them[:3])} and the other {count} contradict each other, and of so few nobody can "
+            f"tell which is wrong: photograph the board more often, so that {_ENOUGH_BOARDS} or more agree"
+        )
     focal = [float(camera.params[0]) for camera in data.cameras]
     scattered = scatter_findings(focal, work.motion, work.sigma_corner)
     if refuse and scattered and explanations.one_camera_doubts(data):

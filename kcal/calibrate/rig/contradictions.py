@@ -76,26 +76,32 @@ def own_fits(problem: RigProblem, state: RigState) -> dict[str, GoodnessOfFit]:
 
 
 def widen_sources(work: Adjustment, mask: Tensor) -> float:
-    """Multiply the stated sigmas of each kind of items by what its fit to itself tells, never below 1.
+    """Multiply the sigmas of each kind of items by what its fit to itself tells, never below 1.
+
+    What bends or moves a board moves all of its corners alike, so that they tell less than their noise and number say.
 
     Returns:
         the largest relative change.
     """
-    change = 0.0
-    for kind, fit in own_fits(work.problem(mask), work.part(mask)).items():
+    change, problem, state = 0.0, work.problem(mask), work.part(mask)
+    fits = {kind: (fit.chi2, fit.freedom) for kind, fit in own_fits(problem, state).items()}
+    if "boards" in work.widened:
+        fits["boards"] = problem.scatter(state)
+    for kind, (chi2, freedom) in fits.items():
         before = work.widened[kind]
-        if before > 1.0 or beyond_chance(fit.chi2, fit.freedom):
-            after = max(1.0, before * math.sqrt(fit.chi2 / fit.freedom))
+        if before > 1.0 or beyond_chance(chi2, freedom):
+            after = max(1.0, before * math.sqrt(chi2 / freedom))
             work.widened = {**work.widened, kind: after}
             change = max(change, abs(after / before - 1.0))
     return change
 
 
 def sigmas_findings(work: Adjustment, fit: GoodnessOfFit) -> list[Finding]:
-    """Doubts of stated sigmas that were multiplied: of sources, and of all together by their fit."""
+    """Doubts of sigmas that were multiplied: of sources, and of all together by their fit."""
+    whose = {"boards": "corners' "}
     texts = [
-        f"the {kind} differ from each other by {times:.1f} times what their sigmas say: their sigmas were multiplied "
-        f"by {times:.1f}"
+        f"the {kind} differ from each other by {times:.1f} times what their {whose.get(kind, '')}sigmas say: "
+        f"their sigmas were multiplied by {times:.1f}"
         for kind, times in work.widened.items()
         if times > 1.0
     ]

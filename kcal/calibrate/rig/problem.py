@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -132,8 +132,7 @@ class RigProblem:
         total, falls = terms @ terms.T + sum(grams, torch.zeros(())), []
         for block, parts, own in zip(self.blocks, found, squares, strict=True):
             if block.many:
-                each = (self._gram(block, _of_item(parts, i)) for i in range(len(block)))
-                others = torch.stack([_others_fall(total, gram) for gram in each])
+                others = torch.stack([_others_fall(total, gram) for gram in self._each_gram(block, parts)])
             else:
                 others = _few_others_fall(
                     total, EliminatedItems(block.joined(parts, self.shared_size), block.size).rows
@@ -176,6 +175,36 @@ class RigProblem:
         """For each block (S + 1, S + 1) products of the rows of all its items, their own unknowns eliminated."""
         found, _ = self._rows(state)
         return [self._gram(block, parts) for block, parts in zip(self.blocks, found, strict=True)]
+
+    def scatter(self, state: RigState) -> tuple[float, float]:
+        """How far boards contradict each other: a χ² and its degrees of freedom, of corners with independent errors.
+
+        With N the reduced normal matrix, a board's score g_i has the covariance N_i - N_i N⁻¹ N_i at the minimum. Its
+        squares g_iᵀ N⁻¹ g_i have the mean tr A_i, with A_i of that covariance in units of N; their sum is like a factor
+        times a χ² of (Σ tr A_i)² / Σ tr A_i² degrees of freedom (Satterthwaite 1946).
+        """
+        terms, (found, _) = self.term_rows(state), self._rows(state)
+        grams = [
+            gram for block, parts in zip(self.blocks, found, strict=True) for gram in self._each_gram(block, parts)
+        ]
+        others = [self._gram(block, parts) for block, parts in zip(self.blocks, found, strict=True) if not block.many]
+        total = sum([*grams, *others], terms @ terms.T)[:-1, :-1]
+        unit = total.diagonal().clamp_min(1e-300).rsqrt()
+        values, vectors = torch.linalg.eigh(total * unit[:, None] * unit)
+        told = values > _LEAST_LEFT
+        root = (vectors[:, told] * values[told].rsqrt()).T * unit
+        squares = mean = spread = 0.0
+        for gram in grams:
+            share = root @ gram[:-1, :-1] @ root.T
+            free = share - share @ share
+            squares += float((root @ gram[:-1, -1]).square().sum())
+            mean, spread = mean + float(free.trace()), spread + float(free.square().sum())
+        return (squares * mean / spread, mean**2 / spread) if spread > 0.0 else (0.0, 0.0)
+
+    def _each_gram(self, block: Block, parts: Sequence[CameraRows]) -> Iterator[Tensor]:
+        """`_gram` of each board alone."""
+        for i in range(len(block) if block.many else 0):
+            yield self._gram(block, [part._replace(rows=part.rows[i : i + 1]) for part in parts])
 
     def response(self, state: RigState, block: Block) -> tuple[Tensor, Tensor]:
         """How the best unknowns of a block's items depend on the shared ones; see `EliminatedItems.response`.
@@ -269,11 +298,6 @@ class RigProblem:
         """The state with its cameras' rotations made orthonormal again after many small steps."""
         found = RigState(*state)
         return found._replace(rotation=nearest_rotation(found.rotation))
-
-
-def _of_item(parts: Sequence[CameraRows], number: int) -> list[CameraRows]:
-    """The rows of one item."""
-    return [part._replace(rows=part.rows[number : number + 1]) for part in parts]
 
 
 def _others_fall(total: Tensor, part: Tensor) -> Tensor:

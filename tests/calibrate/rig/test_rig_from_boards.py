@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -247,6 +248,39 @@ class TestWeights:
             # Parameters that were held have none: all, or the skew of each camera.
             assert bool((sigma[:20] > 0).any()) == refine
             assert sigma[4] == sigma[14] == 0
+
+
+class TestScatter:
+    """Corners of one board that are off alike tell less than their noise and number say."""
+
+    def test_covariance_knows_of_views_that_are_shifted(self) -> None:
+        """By .06 px each, which shows in no residual; without a test of it χ² of the pose is 6 times too large."""
+        squares = []
+        for seed in range(6):
+            pixels = views(10, 2, noise=0.1, noise_seed=seed)
+            assert not solve(pixels, motion=False).findings
+            generator = torch.Generator().manual_seed(seed)
+            pixels[:, 1] += 0.06 * torch.randn(10, 1, 2, generator=generator, dtype=torch.float64)
+            result = solve(pixels, motion=False)
+            (told,) = result.findings
+            assert told.name == "sigmas"
+            times = float(re.findall(r"the boards differ from each other by ([0-9.]+) times", told.text)[0])
+            assert 1.4 < times < 3.0
+            turn = vector_from_rotation(result.stereo().right_from_left_rotation @ ROTATION.T)
+            error = torch.cat([turn, result.stereo().right_from_left_translation - TRANSLATION])
+            squares.append(float(error @ torch.linalg.solve(result.relative_covariance(), error)))
+            # What is said of a corner stays its noise, and the source is as far off as was found.
+            assert result.sigma_corner == pytest.approx(0.1, rel=0.15)
+            assert result.sources[0].sigmas == pytest.approx(1.0, abs=0.1)
+        assert sum(squares) / 6 < 2.0 * 6
+
+    def test_of_few_boards_none_is_left_out(self) -> None:
+        """Found in a real capture: of four pairs a good one was left out, and the baseline was off by 5 sigmas."""
+        pixels = views(5, 2, noise=0.1)
+        pixels[3, 1] += torch.tensor([0.0, 2.0], dtype=torch.float64)
+        with pytest.raises(InputError, match=r"board l3 r3 and the other 4 contradict each other, and of so few"):
+            solve(pixels)
+        assert solve(pixels, reject=False).left_out == ()
 
 
 class TestTurned:
