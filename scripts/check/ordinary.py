@@ -8,7 +8,8 @@ ways. Held out: RMS in pixels over both halves, `scripts.shared.held_out`: as se
 with each view's own motion during the readout refitted as well. *Lost* are seen corners that a camera has no image of;
 they are not in its RMS. Halves: `camera_difference` between both halves' cameras; a ratio of 1 is what their error bars
 state, p is the chance of more. A model that was not measured has no column. `parts`: the same between a few
-views, drawn at random, and the rest.
+views, drawn at random, and the rest. `pairs`: the same of rigs, from a few pairs of views and from the rest: χ² of the
+relative pose over its six degrees of freedom, and z, the difference of inverse ranges over its standard deviation.
 """
 
 from __future__ import annotations
@@ -22,10 +23,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import torch
+from torch import Tensor
 
-from kcal import Camera, KcalError
+from kcal import Camera, KcalError, Localizer, Observations, calibrate_rig
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.lens import camera_difference
+from kcal.calibrate.rig.result import RigResult
+from kcal.lens import camera_difference, vector_from_rotation
+from kcal.locate.stereo import Localization
 from kcal.report import camera_verdict
 from scripts.shared.children import interpreter
 from scripts.shared.held_out import Projection, of_halves
@@ -198,3 +203,76 @@ def parts(
         middle = statistics.median(record["ratio"] for record in known)
         worst = f"{known[-1]['ratio']:.2f} (`{known[-1]['key'][0]}`)"
         yield list(map(str, [count, len(ours), *refused, *beyond, f"{middle:.2f}", worst]))
+
+
+# Left and right of captures by two cameras, view by view at the same moments.
+PAIRS = {"st1": ("st1_l", "st1_r"), "gavin": ("gavin_l", "gavin_r"), "stereo": ("stereo_left", "stereo_right")}
+# Baselines at which ranges are compared, and of the sides of the image.
+AWAY, PLACES = (10.0, 30.0, 100.0), (0.2, 0.5, 0.8)
+
+
+def _rig(sides: list[Observations], pairs: list[int]) -> RigResult:
+    seen = [side.subset([side.names[i] for i in pairs]) for side in sides]
+    left, right = (calibrate_camera(side).camera for side in seen)
+    return calibrate_rig(left, right, seen[0], seen[1], list(zip(seen[0].names, seen[1].names, strict=True)))
+
+
+def _drawn_pairs(name: str, count: int, seed: int) -> Record:
+    """The rig of so many pairs, drawn at random, against that of the others."""
+    sides = [load(side).seen for side in PAIRS[name]]
+    all_of_them = list(range(len(sides[0].views)))
+    drawn = sorted(random.Random(f"{name} {count} {seed}").sample(all_of_them, count))
+    found = []
+    for which, pairs in (("part", drawn), ("rest", [i for i in all_of_them if i not in drawn])):
+        try:
+            found.append(_rig(sides, pairs))
+        except KcalError as refusal:
+            return {"refused": which, "why": str(refusal)}
+    part, rest = (result.stereo() for result in found)
+    turn = vector_from_rotation(part.right_from_left_rotation @ rest.right_from_left_rotation.T)
+    error = torch.cat([turn, part.right_from_left_translation - rest.right_from_left_translation])
+    spread = found[0].relative_covariance() + found[1].relative_covariance()
+    record: Record = {"chi2": float(error @ torch.linalg.solve(spread, error)) / len(error)}
+    wide, high = rest.left.size
+    rays = rest.left.unproject(torch.tensor([[wide * u, high * v] for u in PLACES for v in PLACES]).double())[0]
+    rays = rays / rays.norm(dim=-1, keepdim=True)
+    for away in AWAY:
+        pixels, seen = rest(rays * away * float(rest.baseline))
+        told = [Localizer(rig, pixel_sigma=1e-3)(*pixels[seen.all(-1)].unbind(-2)) for rig in (part, rest)]
+        inverse, sigma = zip(*(_inverse_range(one) for one in told), strict=True)
+        z = (inverse[0] - inverse[1]) / torch.hypot(*sigma)
+        record[f"z {away:g}"] = float(z[z.isfinite()].square().mean().sqrt())
+    return record
+
+
+def _inverse_range(found: Localization) -> tuple[Tensor, Tensor]:
+    """1 / range, and its standard deviation."""
+    far = found.enu.norm(dim=-1)
+    along = found.enu / far[:, None]
+    return 1.0 / far, (along[:, None] @ found.covariance @ along[..., None])[:, 0, 0].sqrt() / far**2
+
+
+@section("ordinary.md", "pairs", captures=("stereo",), views=(6,), seeds=range(1))
+def pairs(
+    kept: Kept = NOT_KEPT,
+    captures: tuple[str, ...] = tuple(PAIRS),
+    views: tuple[int, ...] = (6, 12),
+    seeds: range = range(4),
+) -> Lines:
+    """Names of captures by two cameras, and how many of their pairs are drawn."""
+    keys = [
+        (name, count, seed)
+        for name in captures for count in views for seed in seeds if count <= len(load(PAIRS[name][0]).seen.views) - 6
+    ]  # fmt: skip
+    records = kept.records(keys, _drawn_pairs)
+    yield ["capture", "pairs", "parts", "refused", "χ²/6", *(f"z at {away:g} baselines" for away in AWAY)]
+    for name, count in dict.fromkeys(tuple(key[:2]) for key in keys):
+        ours = [record for record in records if tuple(record["key"][:2]) == (name, count)]
+        known = [record for record in ours if "chi2" in record]
+        z = [f"{statistics.fmean(r[f'z {away:g}'] ** 2 for r in known) ** 0.5:.2f}" for away in AWAY]
+        yield [
+            name,
+            *map(str, [count, len(ours), len(ours) - len(known)]),
+            f"{statistics.fmean(r['chi2'] for r in known):.2f}",
+            *z,
+        ]

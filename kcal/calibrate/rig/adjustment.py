@@ -117,7 +117,7 @@ class Adjustment:
             anchor=self.anchor,
             times=self.widened[source.kind],
             effects=effects,
-            sigma_corner=self.sigma_corner,
+            sigma_corner=self.widened.get("boards", 1.0) * self.sigma_corner,
             motion=self.motion,
         )
 

@@ -84,7 +84,7 @@ def widen_sources(work: Adjustment, mask: Tensor) -> float:
         the largest relative change.
     """
     change, problem, state = 0.0, work.problem(mask), work.part(mask)
-    fits = {kind: (fit.chi2, fit.freedom) for kind, fit in own_fits(problem, state).items()}
+    fits: dict[str, tuple[float, float]] = {**own_fits(problem, state)}
     if "boards" in work.widened:
         fits["boards"] = problem.scatter(state)
     for kind, (chi2, freedom) in fits.items():

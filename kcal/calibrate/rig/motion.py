@@ -81,6 +81,8 @@ _EXACT = 0.01
 _POSE = 6
 # Prior width of shared unknowns, as movement of corners in standard deviations of their noise: nearly no prior.
 _WIDE = 1e3
+# Share of what is seen of motions that combinations of shared unknowns explain, below which they are none of theirs.
+_UNFELT = 1e-10
 # Readouts by which exposures must be apart to be called apart.
 _OTHER_MOMENT = 0.4
 # Of fewer boards, one that is wrong cannot be told from motion.
@@ -213,8 +215,8 @@ class RigRows:
     def told(self, camera: int, white: Tensor) -> tuple[ViewData, PriorFamilies]:
         """Evidence of the good boards on their motions before a camera, with poses and shared unknowns integrated out.
 
-        Shared unknowns enter as combinations that are independent and of unit weight where all boards stand still. At
-        most as many of these depend on motions as there are motions; the others are left out.
+        Shared unknowns enter as combinations that are independent and of unit weight where all boards stand still.
+        Those that explain nothing of any motion are left out: most are of other cameras.
 
         Args:
             camera: its number.
@@ -228,19 +230,20 @@ class RigRows:
         cross[..., torch.cat([shared, shared.new_tensor([-1])])] += moving @ rows[:, _POSE:].mT
         by_shared = cross[..., :-1].flatten(0, 1).T * whole.scale[:, None]
         felt = torch.linalg.solve_triangular(whole.root, by_shared, upper=False)
-        pull, square, freedom = whole.pull, whole.square, float(whole.freedom)
-        if felt.shape[1] < len(felt):
-            basis, felt = torch.linalg.qr(felt)
-            inside = basis.T @ pull
-            square = square - float(pull.square().sum() - inside.square().sum())
-            freedom, pull = freedom - (whole.determined - len(inside)), inside
+        own = moving @ moving.mT - by_pose @ by_pose.mT
+        alone = own.diagonal(dim1=-2, dim2=-1).flatten()
+        share = felt * torch.where(alone > 0, alone.rsqrt(), 0.0)
+        explained, basis = torch.linalg.eigh(share @ share.T)
+        basis = basis[:, explained > _UNFELT]
+        felt, pull = basis.T @ felt, basis.T @ whole.pull
+        square = whole.square - float(whole.pull.square().sum() - pull.square().sum())
+        freedom = whole.freedom - (whole.determined - len(pull) + float((basis.T @ whole.loose).square().sum()))
         size = len(pull)
         products = torch.eye(size + 1, dtype=pull.dtype)
         products[-1, :-1] = products[:-1, -1] = pull
         products[-1, -1] = square
         still = Quadratic(products, freedom, torch.zeros_like(pull))
         cross = torch.cat([felt.T.unflatten(0, (len(moving), -1)), cross[..., -1:]], -1)
-        own = moving @ moving.mT - by_pose @ by_pose.mT
         data = ViewData(still=still, own=own, cross=cross, score=pull.new_zeros(len(moving), size))
         zero, none = torch.zeros_like(pull), torch.full(pull.shape, -1)
         return data, PriorFamilies(zero, torch.full_like(pull, math.log(_WIDE)), none, none, zero)
@@ -256,6 +259,7 @@ class _Whole(NamedTuple):
         root: (S, S) lower triangle of its products in this scale, what is hardly known included.
         pull: (S,) products with the residuals, in combinations of unit weight.
         determined: how many of these combinations the boards determine.
+        loose: (S, S) root of the share of these combinations that nothing determines.
         freedom: residuals, less those that poses take up.
         square: of all residuals.
         variance: mean of that.
@@ -267,6 +271,7 @@ class _Whole(NamedTuple):
     root: Tensor
     pull: Tensor
     determined: float
+    loose: Tensor
     freedom: int
     square: float
     variance: float
@@ -288,9 +293,10 @@ class _Whole(NamedTuple):
         matrix.diagonal().add_(torch.where(length > 0, weak, 1.0))
         root = torch.linalg.cholesky(matrix)
         pull = torch.linalg.solve_triangular(root, (total[:-1, -1] * unit)[:, None], upper=False)[:, 0]
-        inverse = torch.linalg.solve_triangular(root, torch.diag((length > 0).to(root.dtype)), upper=False)
-        determined = int((length > 0).sum()) - weak * float(inverse.square().sum())
-        return cls(pose, half, unit, root, pull, determined, count, square, variance)
+        there = torch.diag((length > 0).to(root.dtype))
+        loose = math.sqrt(weak) * torch.linalg.solve_triangular(root, there, upper=False)
+        determined = float(there.sum() - loose.square().sum())
+        return cls(pose, half, unit, root, pull, determined, loose, count, square, variance)
 
 
 class WithoutMotion:

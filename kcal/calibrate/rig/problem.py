@@ -25,6 +25,8 @@ from kcal.solve.schur import EliminatedItems, PartlyEliminated, SchurLinearizati
 
 # Share of a residual that the others must leave open for an item to be tested by them; less is rounding.
 _LEAST_LEFT = 1e-9
+# Share of what is known of a combination of unknowns that boards must tell for it to be compared between them.
+_LEAST_TOLD = 0.01
 
 
 class RigProblem:
@@ -179,32 +181,37 @@ class RigProblem:
     def scatter(self, state: RigState) -> tuple[float, float]:
         """How far boards contradict each other: a χ² and its degrees of freedom, of corners with independent errors.
 
-        With N the reduced normal matrix, a board's score g_i has the covariance N_i - N_i N⁻¹ N_i at the minimum. Its
-        squares g_iᵀ N⁻¹ g_i have the mean tr A_i, with A_i of that covariance in units of N; their sum is like a factor
-        times a χ² of (Σ tr A_i)² / Σ tr A_i² degrees of freedom (Satterthwaite 1946).
+        With N the reduced normal matrix and H_i the part of board i in units of it, scores g_i of two boards have the
+        covariance δ_ij H_i - H_i H_j at the minimum. The sum of their squares has the mean Σ tr (H_i - H_i²), and is
+        like a multiple of the χ² that has its mean and variance (Satterthwaite 1946).
         """
         terms, (found, _) = self.term_rows(state), self._rows(state)
-        grams = [
-            gram for block, parts in zip(self.blocks, found, strict=True) for gram in self._each_gram(block, parts)
-        ]
-        others = [self._gram(block, parts) for block, parts in zip(self.blocks, found, strict=True) if not block.many]
-        total = sum([*grams, *others], terms @ terms.T)[:-1, :-1]
+        both = list(zip(self.blocks, found, strict=True))
+        seen, others = (
+            sum((self._gram(block, parts) for block, parts in both if block.many == many), terms.new_zeros(()))
+            for many in (True, False)
+        )
+        total = (terms @ terms.T + seen + others)[:-1, :-1]
         unit = total.diagonal().clamp_min(1e-300).rsqrt()
         values, vectors = torch.linalg.eigh(total * unit[:, None] * unit)
         told = values > _LEAST_LEFT
         root = (vectors[:, told] * values[told].rsqrt()).T * unit
-        squares = mean = spread = 0.0
-        for gram in grams:
+        values, vectors = torch.linalg.eigh(root @ seen[:-1, :-1] @ root.T)
+        root = vectors[:, values > _LEAST_TOLD].T @ root
+        squares, mean, spread, shares = 0.0, 0.0, 0.0, total.new_zeros(())
+        for gram in (gram for block, parts in both for gram in self._each_gram(block, parts)):
             share = root @ gram[:-1, :-1] @ root.T
-            free = share - share @ share
+            twice = share @ share
             squares += float((root @ gram[:-1, -1]).square().sum())
-            mean, spread = mean + float(free.trace()), spread + float(free.square().sum())
-        return (squares * mean / spread, mean**2 / spread) if spread > 0.0 else (0.0, 0.0)
+            mean += float((share - twice).trace())
+            spread += float((share - twice).square().sum() - twice.square().sum())
+            shares = shares + twice
+        spread += float(shares.square().sum())
+        return (squares * mean / spread, mean**2 / spread) if mean > 0.0 else (0.0, 0.0)
 
     def _each_gram(self, block: Block, parts: Sequence[CameraRows]) -> Iterator[Tensor]:
         """`_gram` of each board alone."""
-        for i in range(len(block) if block.many else 0):
-            yield self._gram(block, [part._replace(rows=part.rows[i : i + 1]) for part in parts])
+        return (self._gram(block, _of_item(parts, i)) for i in range(len(block) if block.many else 0))
 
     def response(self, state: RigState, block: Block) -> tuple[Tensor, Tensor]:
         """How the best unknowns of a block's items depend on the shared ones; see `EliminatedItems.response`.
@@ -298,6 +305,11 @@ class RigProblem:
         """The state with its cameras' rotations made orthonormal again after many small steps."""
         found = RigState(*state)
         return found._replace(rotation=nearest_rotation(found.rotation))
+
+
+def _of_item(parts: Sequence[CameraRows], number: int) -> list[CameraRows]:
+    """The rows of one item."""
+    return [part._replace(rows=part.rows[number : number + 1]) for part in parts]
 
 
 def _others_fall(total: Tensor, part: Tensor) -> Tensor:

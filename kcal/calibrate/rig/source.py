@@ -199,7 +199,7 @@ class Context(NamedTuple):
         anchor: (3,) from where features are counted, meters.
         times: by which the source's sigmas are multiplied.
         effects: of the source; None without any.
-        sigma_corner: of a board's corner along an axis, px.
+        sigma_corner: of a board's corner along an axis, px, as it counts.
         motion: how boards move while each camera reads its rows.
     """
 

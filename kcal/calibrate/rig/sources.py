@@ -210,7 +210,7 @@ class BoardBlock(Block):
         pixels, points, unknowns = source.pixels[mask], source.points, given.unknowns
         super().__init__(pixels)
         self._unknowns, flat = unknowns, points.new_zeros(0, *points.T.shape)
-        weights = source.whitening(given.times * given.sigma_corner)[mask]
+        weights = source.whitening(given.sigma_corner)[mask]
         # What each camera sees, and what takes motions out of its rows; nothing for cameras that see no board.
         self._seen_by: dict[int, tuple[BoardProblem, WithoutMotion | None]] = {}
         for c, camera in enumerate(given.cameras):

@@ -153,7 +153,9 @@ def test_motion_is_found_and_taken_out() -> None:
     found, without = (sum(surprise(result) for result in results) / 5 for results in (moving, still))
     # Thirty numbers whose squares are one on the average, or twice that where amplitudes are hardly known.
     assert found < 3.0
-    assert without > 10.0 * found
+    # Not taken out, it is at least known: boards contradict each other.
+    assert 1.5 * found < without < 5.0 * found
+    assert all("sigmas" in [finding.name for finding in result.findings] for result in still)
     turns, others = (sum(float(error(result)[:3].square().sum()) for result in results) for results in (moving, still))
     assert turns < 0.5 * others
     assert all(result.sigma_corner == pytest.approx(0.1, rel=0.35) for result in moving)
@@ -242,7 +244,7 @@ def test_a_lens_whose_calibration_says_that_it_moves() -> None:
     for camera in cameras:
         known = 1e-6 * torch.eye(len(CAMERA.params), dtype=F64)
         camera.calibration = CameraCalibration(covariance=known, record=record)
-    seen = captured(False, 0)
+    seen = captured(False, 1)
     found = calibrate_rig(*cameras, *seen, [(name, name) for name in seen[0].names])
     assert [finding.name for finding in found.findings] == ["moving-lens"] * 2
     # Of both cameras: shifts to the right are turns about the axis that points down.

@@ -79,10 +79,10 @@ def test_views_in_both_count_once() -> None:
 
 def test_further_views_help() -> None:
     """Eight of the calibration's fourteen views in the rig: better than these alone, no better than all of them."""
-    some, alone, everything = rig("opencv5", 14, 8), rig("opencv5", 8, 8), rig("opencv5", 14, 14)
-    # Of k2, which views near the border tell.
+    some, alone, everything = rig("hybrid", 14, 8), rig("hybrid", 8, 8), rig("hybrid", 14, 14)
+    # Of the second parameter of the lens, which views near the border tell.
     bend = [float(found.joint_covariance()[6, 6].sqrt()) for found in (alone, some, everything)]
-    assert bend[0] > 1.5 * bend[1]
+    assert bend[0] > 1.3 * bend[1]
     assert bend[2] < bend[1] < 1.2 * bend[2]
 
 
