@@ -522,7 +522,7 @@ def rig_result(
     if only_boards and count < _FEW_BOARDS:
         doubt("pairs", f"{counted_text(count, 'pair')} only: a wrong one could not be noticed", "5 or more are good")
     against_them = [name for i, name in enumerate(work.labels) if not mask[i] and i not in reasons]
-    if only_boards and refuse and against_them and count < _ENOUGH_BOARDS:
+    if only_boards and refuse and against_them and len(data.cameras) == 2 and count < _ENOUGH_BOARDS:
         raise InputError(
             f"{' and '.join(against_them[:3])} and the other {count} contradict each other, and of so few nobody can "
             f"tell which is wrong: photograph the board more often, so that {_ENOUGH_BOARDS} or more agree"

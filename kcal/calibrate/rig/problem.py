@@ -207,7 +207,7 @@ class RigProblem:
             spread += float((share - twice).square().sum() - twice.square().sum())
             shares = shares + twice
         spread += float(shares.square().sum())
-        return (squares * mean / spread, mean**2 / spread) if mean > 0.0 else (0.0, 0.0)
+        return (squares * mean / spread, mean**2 / spread) if mean > _LEAST_TOLD else (0.0, 0.0)
 
     def _each_gram(self, block: Block, parts: Sequence[CameraRows]) -> Iterator[Tensor]:
         """`_gram` of each board alone."""
