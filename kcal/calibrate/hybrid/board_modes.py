@@ -132,9 +132,10 @@ def turned_corners(values: Tensor, board: Board, turns: Tensor) -> Tensor:
     return torch.stack([view[orders[k]] for view, k in zip(values, turns.tolist(), strict=True)])
 
 
-def turned_corner_offsets(offsets: Tensor, board: Board, turns: int) -> Tensor:
-    """(N, 2) displacements of the corners after quarter turns of the board, from those before."""
-    back = torch.linalg.matrix_power(_QUARTER[:2, :2], turns)
+def turned_deviation(offsets: Tensor, board: Board, turns: int) -> Tensor:
+    """(N, 2) or (N, 3) displacements of the corners after quarter turns of the board, from those before."""
+    size = offsets.shape[-1]
+    back = torch.linalg.matrix_power(_QUARTER[:size, :size], turns)
     return turned_corners(offsets[None], board, torch.tensor([turns]))[0] @ back.T
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.board_modes import CLEAR, find_turns, turned, turned_corner_offsets, turned_corners
+from kcal.calibrate.hybrid.board_modes import CLEAR, find_turns, turned, turned_corners, turned_deviation
 from kcal.calibrate.hybrid.evidence import Quadratic, negative_log_evidence
 from kcal.calibrate.hybrid.families import BEFORE_LENS, BOARD, Hyperprior, LensPrior, PriorFamilies, typical_hyperprior
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
@@ -544,5 +544,5 @@ def _corners_of(
         if camera.board == board and i != but and camera.fit.displaced is not None:
             # A whole camera may have been turned since it was fitted.
             turn = int((camera.turns - turns)[0]) % 4
-            found.append(turned_corner_offsets(camera.fit.displaced, seen.board, turn))
+            found.append(turned_deviation(camera.fit.displaced, seen.board, turn))
     return torch.stack(found).mean(0) if found else None

@@ -17,7 +17,7 @@ from kcal.bag import pair_stamps, stamp_in
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import Views, poses_under, refine_poses
 from kcal.calibrate.rig.sources import Boards, RigData
-from kcal.corners.board import Board
+from kcal.calibrate.rig.unknowns import board_deviation
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
@@ -156,25 +156,6 @@ def read_pairs(path: str | Path, left: Sequence[str], right: Sequence[str]) -> l
     return pairs
 
 
-def _deviation(cameras: Sequence[Camera], board: Board) -> Tensor | None:
-    """(N, 3) meters by which the corners lie elsewhere than ordered, as the calibrations of the cameras found.
-
-    The mean of what the cameras found. A board that looks alike after half a turn may have been read from either end:
-    what follows the first camera's deviation better counts.
-    """
-    found: list[Tensor] = []
-    for camera in cameras:
-        record = None if camera.calibration is None else camera.calibration.record
-        if record is None or record.board_deviation is None or record.board != board.record:
-            continue
-        own = torch.tensor(record.board_deviation, dtype=torch.float64)
-        turned = own.flip(0) * torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
-        if found and not board.unambiguous and (turned - found[0]).norm() < (own - found[0]).norm():
-            own = turned
-        found.append(own)
-    return torch.stack(found).mean(0) if found else None
-
-
 def paired_boards(
     cameras: tuple[Camera, Camera], observations: tuple[Observations, Observations], pairs: Sequence[Pair]
 ) -> Boards:
@@ -253,7 +234,7 @@ def _boards_at(
         board=board,
         pixels=pixels,
         names=tuple(name for name, _ in moments),
-        deviation=_deviation([cameras[number] for number in observations], board),
+        deviation=board_deviation([cameras[number] for number in observations], board),
         views=tuple(tuple(own.get(c, "") for _, own in moments) for c in range(len(cameras))),
         covariance=covariance if known else None,
     )

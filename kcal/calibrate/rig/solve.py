@@ -25,7 +25,7 @@ from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
 from kcal.calibrate.rig.pairs import Pair, evenly, paired_boards, pose_alone
 from kcal.calibrate.rig.result import Reasons, RigResult, records
 from kcal.calibrate.rig.sources import MINIMUM_CORNERS, Boards, RigData
-from kcal.calibrate.rig.unknowns import SharedUnknowns, deviation_of, free, gathered, held, joint_unknowns, less
+from kcal.calibrate.rig.unknowns import SharedUnknowns, board_deviation, free, gathered, held, joint_unknowns, less
 from kcal.corners.observations import Observations
 from kcal.errors import InputError
 from kcal.finding import Finding
@@ -152,7 +152,8 @@ def without_repeated(
     if with_board:
         # Single corners may be off their places beside the modes.
         smooth = torch.einsum("b,bcn->nc", amplitudes, shapes)
-        points = boards.board.points + deviation_of(camera, boards.board, smooth) - smooth
+        found = board_deviation([camera], boards.board)
+        points = boards.board.points + (0.0 if found is None else found - smooth)
     problem = BoardProblem(
         points,
         pixels,

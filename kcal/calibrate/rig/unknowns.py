@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.hybrid.board_modes import CLEAR, BoardModes, board_modes, mode_turn, turned
+from kcal.calibrate.hybrid.board_modes import CLEAR, BoardModes, board_modes, mode_turn, turned, turned_deviation
 from kcal.calibrate.hybrid.families import BOARD, typical_hyperprior
 from kcal.calibrate.hybrid.measured_board import printed_board, printed_prior
 from kcal.calibrate.problem.state import warp_modes
@@ -282,23 +282,30 @@ def joint_unknowns(
     )
     if modes is None:
         return found, None
-    smooth = torch.einsum("b,bcn->nc", amplitudes, shapes)
-    first = next((camera for camera, part in zip(cameras, parts, strict=True) if part and part.board_size), None)
-    return found, smooth if first is None or board is None else deviation_of(first, board, smooth)
+    sharing = [camera for camera, part in zip(cameras, parts, strict=True) if part is not None and part.board_size]
+    found_by = None if board is None else board_deviation(sharing, board)
+    if found_by is None:
+        return found, torch.einsum("b,bcn->nc", amplitudes, shapes)
+    # Single corners are off beside the modes, by the mean of what the cameras found.
+    middle = torch.stack([part.estimate[part.lens_size :] for part in shared]).mean(0)
+    return found, found_by + torch.einsum("b,bcn->nc", amplitudes - middle, shapes)
 
 
-def deviation_of(camera: Camera, board: Board, smooth: Tensor) -> Tensor:
-    """(N, 3) meters by which a camera's calibration found its board off the order, single corners included.
+def board_deviation(cameras: Sequence[Camera], board: Board) -> Tensor | None:
+    """(N, 3) meters by which the corners lie elsewhere than ordered: the mean of what the cameras' calibrations found.
 
-    Args:
-        camera: the camera.
-        board: of the rig; of another one nothing is known beside the modes.
-        smooth: (N, 3) the same without single corners, from the modes of its board.
+    A board that looks alike from several ends may have been read from any: what follows the first camera's deviation
+    best counts.
     """
-    record = None if camera.calibration is None else camera.calibration.record
-    if record is None or record.board_deviation is None or record.board != board.record:
-        return smooth
-    return torch.tensor(record.board_deviation, dtype=torch.float64)
+    found: list[Tensor] = []
+    for camera in cameras:
+        record = None if camera.calibration is None else camera.calibration.record
+        if record is None or record.board_deviation is None or record.board != board.record:
+            continue
+        own = torch.tensor(record.board_deviation, dtype=torch.float64)
+        ends = [turned_deviation(own, board, turns) for turns in board.quarter_turns]
+        found.append(min(ends, key=lambda end: float((end - (found or ends)[0]).norm())))
+    return torch.stack(found).mean(0) if found else None
 
 
 class _GivenBoard(NamedTuple):

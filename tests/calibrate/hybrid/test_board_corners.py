@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kcal import Board, Camera, InputError, Observations, load_camera
 from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.hybrid.board_modes import board_modes, turned_corner_offsets, turned_corners
+from kcal.calibrate.hybrid.board_modes import board_modes, turned_corners, turned_deviation
 from kcal.calibrate.hybrid.cameras_fit import CamerasFit, fit_cameras
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_board, off_by, save_measured_board
@@ -153,7 +153,7 @@ def test_turned_boards() -> None:
     for turn in range(4):
         there = turned_corners(moved[None], board, torch.tensor([turn]))[0]
         quarter = torch.linalg.matrix_power(torch.tensor([[0.0, 1.0], [-1.0, 0.0]]).double(), turn)
-        ours = board.points[:, :2] - board.points[:, :2].mean(0) + turned_corner_offsets(off, board, turn)
+        ours = board.points[:, :2] - board.points[:, :2].mean(0) + turned_deviation(off, board, turn)
         torch.testing.assert_close(ours, there @ quarter.T)
 
 
@@ -174,9 +174,9 @@ def test_cameras_tell_each_other_of_them(tmp_path: Path) -> None:
     (board,) = found.boards
     assert board.corners is not None
     order = int(found.cameras[0].turns[0])
-    assert agreement(board.corners, turned_corner_offsets(PLANTED, BOARD, order)) > 0.9
+    assert agreement(board.corners, turned_deviation(PLANTED, BOARD, order)) > 0.9
     for camera in found.cameras:
-        assert agreement(camera.fit.displaced, turned_corner_offsets(PLANTED, BOARD, order)) > 0.9
+        assert agreement(camera.fit.displaced, turned_deviation(PLANTED, BOARD, order)) > 0.9
     read = load_measured_board(save_measured_board(board, tmp_path / "plate.board.json"))
     assert read.corners is not None
     assert torch.equal(read.corners, board.corners)

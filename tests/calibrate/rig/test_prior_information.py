@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 
@@ -99,6 +100,20 @@ def test_hybrid_cameras_are_refined_with_their_board() -> None:
     assert prior.relative_covariance()[1, 1] > 4.0 * held.relative_covariance()[1, 1]
     error = float((stereo.right_from_left_translation - TRANSLATION).norm())
     assert error < 4.0 * float(prior.sigma_translation.norm())
+
+
+def test_single_corners_are_off_by_what_both_cameras_found() -> None:
+    """Found: the second camera had those of the first, which a few views tell to no more than half of what they are."""
+    both = [copy.deepcopy(camera) for camera in cameras("hybrid", tuple(f"{i}.png" for i in range(14)))]
+    parts = gathered(both, [known(camera) for camera in both], BOARD)[0]
+    before = joint_unknowns(both, parts, BOARD)[1]
+    planted = 1e-4 * torch.randn(2, BOARD.corners, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    for camera, off in zip(both, planted, strict=True):
+        record = camera.calibration.record
+        moved = torch.tensor(record.board_deviation, dtype=torch.float64) + off
+        record = dataclasses.replace(record, board_deviation=tuple(map(tuple, moved.tolist())))
+        camera.calibration = dataclasses.replace(camera.calibration, record=record)
+    torch.testing.assert_close(joint_unknowns(both, parts, BOARD)[1] - before, planted.mean(0), rtol=0, atol=1e-12)
 
 
 def test_rows_taken_out_and_put_back() -> None:
