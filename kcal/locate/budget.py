@@ -123,7 +123,7 @@ def range_errors(
         along = nearer / torch.linalg.vector_norm(nearer, dim=-1, keepdim=True)
         moved = {
             "disparity": lambda s: (rig, right + s * errors.disparity_px * along),
-            "yaw": lambda s: (_yawed(rig, s * math.radians(errors.yaw_deg)), right),
+            "yaw": lambda s: (right_turned(rig, far.new_tensor([0.0, s * math.radians(errors.yaw_deg), 0.0])), right),
             "baseline": lambda s: (_stretched(rig, s * errors.baseline_m), right),
             "timing": lambda s: (
                 rig,
@@ -192,8 +192,9 @@ def _crossing(rig: Rig, ray: Tensor) -> Tensor:
     return across / length
 
 
-def _yawed(rig: Rig, yaw: float) -> Rig:
-    turn = rotation_from_vector(torch.tensor([0.0, yaw, 0.0], dtype=torch.float64))
+def right_turned(rig: Rig, vector: Tensor) -> Rig:
+    """The rig with its right camera turned about its own axes by a rotation vector (3,), radians."""
+    turn = rotation_from_vector(vector)
     # About its own center: the center stays where it is.
     return Rig.pair(rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation)
 

@@ -134,14 +134,8 @@ def camera_features(run: Located) -> list[bytes]:
     for camera in run.cameras:
         properties: dict[str, Any] = {"name": f"{camera.name} camera", "kind": "camera"}
         if camera.name == "left":
-            properties |= {
-                "heading_deg": run.heading_deg,
-                "pitch_deg": run.pitch_deg,
-                "roll_deg": run.roll_deg,
-                "pixel_sigma": run.pixel_sigma,
-                "range_interval": run.interval_note,
-                "geoid": run.geoid,
-            }
+            properties |= {name: getattr(run, name) for name in ("heading_deg", "pitch_deg", "roll_deg", "pixel_sigma")}
+            properties |= {"range_interval": run.interval_note, "geoid": run.geoid}
         lat, lon, height = camera.geodetic
         features.append(_feature({"type": "Point", "coordinates": [lon, lat, height]}, properties))
     return features
