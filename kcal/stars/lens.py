@@ -243,11 +243,9 @@ def _agreement_with(stars: Tensor, change: Tensor, lens: CameraInformation, coun
     squares = ((left.T @ residual).square() / (1.0 + told.square()))[use]
     chi2, freedom = float(squares.sum()), int(use.sum())
     # A change of focus is one direction, which the sum over many that agree would hide.
-    by_chance = (
-        min(float(stats.chi2.sf(chi2, freedom)), freedom * float(stats.chi2.sf(float(squares.max()), 1)))
-        if freedom
-        else 1.0
-    )
+    by_chance = 1.0
+    if freedom:
+        by_chance = min(float(stats.chi2.sf(chi2, freedom)), freedom * float(stats.chi2.sf(float(squares.max()), 1)))
     return Agreement(
         chi2=chi2,
         freedom=freedom,
