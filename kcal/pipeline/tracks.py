@@ -272,7 +272,7 @@ class _Compiled:
     def __call__(self, *arguments: Any) -> Any:
         # Other strides would need other code.
         given = [_contiguous(argument) for argument in arguments]
-        tensors = [tensor for argument in given for tensor in _tensors_in(argument)]
+        tensors = [one for part in given if part is not None for one in (part if isinstance(part, tuple) else (part,))]
         if self.free is None:
             every = [(i, axis) for i, tensor in enumerate(tensors) for axis in range(tensor.ndim)]
             self.free = [(i, axis) for i, axis in every if tensors[i].shape[axis] in _STAND_INS]
@@ -281,12 +281,6 @@ class _Compiled:
         if min(tensors[i].shape[axis] for i, axis in self.free) < 2:
             return self.step(*arguments)
         return self.made(*given)
-
-
-def _tensors_in(value: Any) -> tuple[Tensor, ...]:
-    if value is None:
-        return ()
-    return (value,) if isinstance(value, Tensor) else value
 
 
 def _contiguous(value: Any) -> Any:
