@@ -133,7 +133,7 @@ def range_errors(
         found = {}
         for name, move in moved.items():
             # With a millionth of the error, too: far from rounding, and no longer curved.
-            *ends, low, high = (_range(*move(sign), left) for sign in (-1.0, 1.0, -1e-5, 1e-5))
+            *ends, low, high = (measured_ranges(*move(sign), left) for sign in (-1.0, 1.0, -1e-5, 1e-5))
             changes = [end - far for end in ends]
             found[name] = RangeError(torch.minimum(*changes), torch.maximum(*changes), (high - low).abs() / 2e-5)
     return found
@@ -164,8 +164,8 @@ def points_at(
     return far, points, left, right
 
 
-def _range(rig: Rig, right: Tensor, left: Tensor) -> Tensor:
-    """Range from the left camera; infinite where the rays do not meet ahead."""
+def measured_ranges(rig: Rig, right: Tensor, left: Tensor) -> Tensor:
+    """Ranges from the left camera by pixels (N, 2); infinite where the rays do not meet ahead."""
     lines = sight_lines(rig, left, right)
     distance = torch.linalg.vector_norm(lines.points, dim=-1)
     return torch.where(lines.status == int(PositionStatus.OK), distance, math.inf)

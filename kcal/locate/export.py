@@ -588,8 +588,7 @@ def read_positions(path: str | Path, locate: PointLocator) -> Located:
         numbers = np.full((len(chunk.names), len(NUMBERS)), np.nan)
         try:
             status = np.array([_CODES[text] for text in cells["status"]], np.int8)
-            for name in names:
-                place = names.index(name) if run.origin else _OWN_COLUMNS[names.index(name)]
+            for name, place in zip(names, range(len(NUMBERS)) if run.origin else _OWN_COLUMNS, strict=True):
                 numbers[:, place] = [float(cell or "nan") for cell in cells[name]]
         except (KeyError, ValueError) as error:
             raise FileError(f"{path}: lines {chunk.lines[0]} to {chunk.lines[-1]}: {error} is none of kcal") from error

@@ -172,12 +172,13 @@ def _refined_border(light: Floats, path: NDArray[np.int64], noise: Floats) -> Bo
     rows, columns = light.shape
     inside = (path >= 2 * _BOX + 1) & (path < rows - 2 * _BOX - 1)
     offset = np.arange(-_REACH, _REACH)
+    at = (offset + 0.5).astype(np.float64)
     # An edge between the rows path - 1 and path stands at path - 0.5.
     index = np.clip(path[:, None] + offset, 0, rows - 1)
     value = light[index, np.arange(columns)[:, None]]
     blur: Floats = np.full(columns, _BLUR)
     for own_blur in (True, False):
-        place, step, width, variance, left = _fit_steps(offset + 0.5, value, blur, own_blur=own_blur)
+        place, step, width, variance, left = _fit_steps(at, value, blur, own_blur=own_blur)
         good = inside & (np.abs(place) < _MOST_MOVE) & (np.abs(step) > _SURE * noise)
         if own_blur:
             # A lens has one blur, and a slanting edge a wider one.

@@ -26,10 +26,10 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import fit_turn, rotation_from_vector, seen_turned, vector_from_rotation
 from kcal.lens.projection import FAR
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig
-from kcal.locate.budget import right_turned, usual_ranges
+from kcal.locate.budget import measured_ranges, right_turned, usual_ranges
 from kcal.locate.marks import Marks
 from kcal.locate.mounting import attitude
-from kcal.locate.stereo import PositionStatus, sight_lines
+from kcal.locate.stereo import sight_lines
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief
 from kcal.threads import in_one_thread
@@ -279,12 +279,11 @@ class Drift:
             right, beside = new.right.project(new.right_from_left(points))
             if not bool((ahead & beside).all()):
                 raise InputError("the cameras do not look the same way: the effect of a drift cannot be computed")
-            lines = sight_lines(old, left, right)
-            found = torch.linalg.vector_norm(lines.points, dim=-1)
+            found = measured_ranges(old, right, left)
             # Turning the right camera by ω about its x, y, z moves a point's image; the range follows the disparity.
             rows = torch.stack([_range_slope(new, points, axis) for axis in torch.eye(3, dtype=torch.float64)], -1)
         sigma = (rows @ self.relative_covariance * rows).sum(-1).clamp_min(0.0).sqrt()
-        return DriftEffect(far, torch.where(lines.status == int(PositionStatus.OK), found, math.inf), sigma)
+        return DriftEffect(far, found, sigma)
 
     @in_one_thread
     def relocked(self, note: str) -> Rig:
