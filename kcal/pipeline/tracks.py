@@ -546,7 +546,8 @@ class Tracker:
         track, which = close.nonzero(as_tuple=True)
         found = self.steps.score(merged, frame, home, part, when, root, track, which)
         possible = within(found, track, which, self.gates[part.seen.sum(0)[which]])
-        evidence, tiers = zip(*((track.evidence, self._tier(track)) for track in self.records), strict=True)
+        evidence = [track.evidence for track in self.records]
+        tiers = [0 if self._is_told(track) else 1 if track.number == 0 else -1 for track in self.records]
         accepted = sorted(assigned(possible, [ends[i] for i in rows.tolist()], evidence, tiers))
         if not accepted:
             return set()
@@ -567,9 +568,6 @@ class Tracker:
         root = self.shared.root[self.calibration :].unflatten(0, clock.shape[:2])
         unsure = (root[..., None] * clock[:, :, None]).sum(1).square().sum(1).sqrt()
         return imm.Timing(delay, clock, unsure)
-
-    def _tier(self, track: TrackRecord) -> int:
-        return 0 if self._is_told(track) else 1 if track.number == 0 else -1
 
     def _update(
         self,
