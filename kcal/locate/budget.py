@@ -123,7 +123,7 @@ def range_errors(
         along = nearer / torch.linalg.vector_norm(nearer, dim=-1, keepdim=True)
         moved = {
             "disparity": lambda s: (rig, right + s * errors.disparity_px * along),
-            "yaw": lambda s: (_yawed(rig, s * math.radians(errors.yaw_deg)), right),
+            "yaw": lambda s: (right_turned(rig, far.new_tensor([0.0, s * math.radians(errors.yaw_deg), 0.0])), right),
             "baseline": lambda s: (_stretched(rig, s * errors.baseline_m), right),
             "timing": lambda s: (
                 rig,
@@ -133,7 +133,7 @@ def range_errors(
         found = {}
         for name, move in moved.items():
             # With a millionth of the error, too: far from rounding, and no longer curved.
-            *ends, low, high = (_range(*move(sign), left) for sign in (-1.0, 1.0, -1e-5, 1e-5))
+            *ends, low, high = (measured_ranges(*move(sign), left) for sign in (-1.0, 1.0, -1e-5, 1e-5))
             changes = [end - far for end in ends]
             found[name] = RangeError(torch.minimum(*changes), torch.maximum(*changes), (high - low).abs() / 2e-5)
     return found
@@ -164,8 +164,8 @@ def points_at(
     return far, points, left, right
 
 
-def _range(rig: Rig, right: Tensor, left: Tensor) -> Tensor:
-    """Range from the left camera; infinite where the rays do not meet ahead."""
+def measured_ranges(rig: Rig, right: Tensor, left: Tensor) -> Tensor:
+    """Ranges from the left camera by pixels (N, 2); infinite where the rays do not meet ahead."""
     lines = sight_lines(rig, left, right)
     distance = torch.linalg.vector_norm(lines.points, dim=-1)
     return torch.where(lines.status == int(PositionStatus.OK), distance, math.inf)
@@ -192,8 +192,9 @@ def _crossing(rig: Rig, ray: Tensor) -> Tensor:
     return across / length
 
 
-def _yawed(rig: Rig, yaw: float) -> Rig:
-    turn = rotation_from_vector(torch.tensor([0.0, yaw, 0.0], dtype=torch.float64))
+def right_turned(rig: Rig, vector: Tensor) -> Rig:
+    """The rig with its right camera turned about its own axes by a rotation vector (3,), radians."""
+    turn = rotation_from_vector(vector)
     # About its own center: the center stays where it is.
     return Rig.pair(rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation)
 

@@ -134,14 +134,8 @@ def camera_features(run: Located) -> list[bytes]:
     for camera in run.cameras:
         properties: dict[str, Any] = {"name": f"{camera.name} camera", "kind": "camera"}
         if camera.name == "left":
-            properties |= {
-                "heading_deg": run.heading_deg,
-                "pitch_deg": run.pitch_deg,
-                "roll_deg": run.roll_deg,
-                "pixel_sigma": run.pixel_sigma,
-                "range_interval": run.interval_note,
-                "geoid": run.geoid,
-            }
+            properties |= {name: getattr(run, name) for name in ("heading_deg", "pitch_deg", "roll_deg", "pixel_sigma")}
+            properties |= {"range_interval": run.interval_note, "geoid": run.geoid}
         lat, lon, height = camera.geodetic
         features.append(_feature({"type": "Point", "coordinates": [lon, lat, height]}, properties))
     return features
@@ -594,8 +588,7 @@ def read_positions(path: str | Path, locate: PointLocator) -> Located:
         numbers = np.full((len(chunk.names), len(NUMBERS)), np.nan)
         try:
             status = np.array([_CODES[text] for text in cells["status"]], np.int8)
-            for name in names:
-                place = names.index(name) if run.origin else _OWN_COLUMNS[names.index(name)]
+            for name, place in zip(names, range(len(NUMBERS)) if run.origin else _OWN_COLUMNS, strict=True):
                 numbers[:, place] = [float(cell or "nan") for cell in cells[name]]
         except (KeyError, ValueError) as error:
             raise FileError(f"{path}: lines {chunk.lines[0]} to {chunk.lines[-1]}: {error} is none of kcal") from error

@@ -170,23 +170,20 @@ class Localizer(Operations, Movable, StatedModule):
 
     def _weigh(self, rig: Rig) -> None:
         """Prepare weights by all errors; nothing of it where marks alone weigh."""
-        names = ("up", "heights", "errors", "bending_errors", "limits")
-        if self.weights == "marks":
-            for name in names:
-                self.register_buffer(name, None)
-            return
-        up = heights = None
-        if rig.origin is not None:
-            assert self.ecef_from_enu is not None
-            geodetic = enu_to_geodetic(rig.center.detach(), rig.origin)
-            ups = [ecef_from_enu_rotation(lat, lon)[:, 2].to(geodetic) for lat, lon, _ in geodetic.tolist()]
-            up, heights = torch.stack(ups) @ self.ecef_from_enu, geodetic[:, 2]
-        errors, bending, self.lens = viewing.errors_by_camera(rig)
-        bending = None if bending is None else bending * self.half_curvature
-        freedom = 2.0 * torch.arange(len(rig) + 1, dtype=torch.float64) - 3.0
-        limits = torch.stack([chi2_quantile(freedom.clamp_min(1.0), 1.0 - p) for p in (_BAD, _DOUBTFUL)])
-        values = up, heights, errors, bending, limits.to(rig.translation.device)
-        for name, value in zip(names, values, strict=True):
+        up = heights = errors = bending = limits = None
+        if self.weights == "all":
+            if rig.origin is not None:
+                assert self.ecef_from_enu is not None
+                geodetic = enu_to_geodetic(rig.center.detach(), rig.origin)
+                ups = [ecef_from_enu_rotation(lat, lon)[:, 2].to(geodetic) for lat, lon, _ in geodetic.tolist()]
+                up, heights = torch.stack(ups) @ self.ecef_from_enu, geodetic[:, 2]
+            errors, bending, self.lens = viewing.errors_by_camera(rig)
+            bending = None if bending is None else bending * self.half_curvature
+            freedom = 2.0 * torch.arange(len(rig) + 1, dtype=torch.float64) - 3.0
+            limits = torch.stack([chi2_quantile(freedom.clamp_min(1.0), 1.0 - p) for p in (_BAD, _DOUBTFUL)])
+            limits = limits.to(rig.translation.device)
+        values = {"up": up, "heights": heights, "errors": errors, "bending_errors": bending, "limits": limits}
+        for name, value in values.items():
             self.register_buffer(name, value)
 
     def _stand(self, rig: Rig) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -289,14 +289,13 @@ def read_sightings(path: str | Path, cameras: Sequence[str]) -> tuple[Sighting, 
         ...     read_sightings(path, ("left", "right"))[0].times.tolist()
         [0.0, 0.5]
     """
-    number: Mapping[str, int] = {name: c for c, name in enumerate(cameras)}
     of: dict[tuple[int, str], dict[float, tuple[float, float, float]]] = {}
     for chunk in read_chunks(path, ",".join(_SEEN), (*_SEEN, "sigma", "note"), _SEEN, unique=False):
         for row in chunk.rows():
             camera = row.cells["camera"]
-            if camera not in number:
+            if camera not in cameras:
                 raise FileError(f"{row.where}: no camera is named {camera!r}; they are {', '.join(cameras)}")
-            own = of.setdefault((number[camera], row.name), {})
+            own = of.setdefault((cameras.index(camera), row.name), {})
             time = time_of_row(row)
             if time in own:
                 raise FileError(f"{row.where}: {row.name!r} was seen by {camera} at that time before; once is needed")

@@ -176,8 +176,8 @@ class PointLocator:
         if rig.origin is not None:
             own = found._replace(bearing=(own_axes(rig)[found.anchor] @ found.bearing[..., None])[..., 0])
         extras = {
-            "cameras": [_camera_list(rig, row) for row in found.used.tolist()],
-            "left_out": [_camera_list(rig, row) for row in found.bad.tolist()],
+            "cameras": [camera_list(rig, row) for row in found.used.tolist()],
+            "left_out": [camera_list(rig, row) for row in found.bad.tolist()],
             "misfit_sigmas": [
                 " ".join(f"{name}={value:.1f}" for name, value in zip(rig.names, row, strict=True) if value > 0)
                 for row in found.misfit.tolist()
@@ -270,7 +270,8 @@ def _pair_reason(status: PositionStatus, found: Localization, i: int, baseline: 
     return f"doubtful: the reprojection error of {worst:.1f} px is too large for noise; {_ELSEWHERE}"
 
 
-def _camera_list(rig: Rig, which: Sequence[bool]) -> str:
+def camera_list(rig: Rig, which: Sequence[bool]) -> str:
+    """The names of some cameras, with blanks between."""
     return " ".join(name for name, one in zip(rig.names, which, strict=True) if one)
 
 
@@ -281,7 +282,7 @@ def _view_reasons(rig: Rig, found: Localization) -> list[str]:
         text = _VIEW_TEXTS.get(PositionStatus(status), "")
         if any(bad):
             worst = max(value for value, one in zip(misfit, bad, strict=True) if one)
-            text = f"left out: the mark in {_camera_list(rig, bad)} contradicts the others ({worst:.0f} sigma); {text}"
+            text = f"left out: the mark in {camera_list(rig, bad)} contradicts the others ({worst:.0f} sigma); {text}"
         reasons.append(text.removesuffix("; "))
     return reasons
 

@@ -7,7 +7,7 @@ import math
 import warnings
 import xml.etree.ElementTree
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -288,9 +288,8 @@ def camera_positions(survey: Survey, cameras: Sequence[str]) -> tuple[MeasuredPo
     unknown = [name for name in survey.names if name not in cameras]
     if unknown:
         raise InputError(f"camera positions: {unknown[0]!r} is no camera; the names are {', '.join(cameras)}")
-    numbers: Mapping[str, int] = {name: number for number, name in enumerate(cameras)}
     return tuple(
-        MeasuredPosition(camera=numbers[name], point=point, sigma=sigma)
+        MeasuredPosition(camera=cameras.index(name), point=point, sigma=sigma)
         for name, point, sigma in zip(survey.names, survey.points, survey.sigma, strict=True)
     )
 

@@ -68,7 +68,12 @@ class CotSender:
     """
 
     def __init__(self, address: str, stale_s: float = 10.0) -> None:
-        self._tcp, self._target = _network_address(address, ("udp", "tcp"))
+        parts, port = urlsplit(address), None
+        with contextlib.suppress(ValueError):
+            port = parts.port
+        if parts.scheme not in ("udp", "tcp") or not parts.hostname or not port or parts.path:
+            raise InputError(f"{_without_password(address)}: write udp://HOST:PORT or tcp://HOST:PORT")
+        self._tcp, self._target = parts.scheme == "tcp", (parts.hostname, port)
         self._stale_s, self._socket, self._next_try = stale_s, None, 0.0
         self.failed = 0
 
@@ -168,16 +173,6 @@ class MqttSender:
     def _forget_arrived(self) -> None:
         while self._sent and all(message.is_published() for message in self._sent[0]):
             self._sent.popleft()
-
-
-def _network_address(address: str, schemes: tuple[str, str]) -> tuple[bool, tuple[str, int]]:
-    parts = urlsplit(address)
-    port = None
-    with contextlib.suppress(ValueError):
-        port = parts.port
-    if parts.scheme not in schemes or not parts.hostname or not port or parts.path:
-        raise InputError(f"{_without_password(address)}: write {schemes[0]}://HOST:PORT or {schemes[1]}://HOST:PORT")
-    return parts.scheme == schemes[1], (parts.hostname, port)
 
 
 def _without_password(address: str) -> str:

@@ -23,7 +23,7 @@ from kcal.errors import FileError, InputError
 from kcal.files import FileLock, read_bytes, write_atomic
 from kcal.lens.rig import Rig
 from kcal.locate.export import APPENDED, appended
-from kcal.locate.points import own_axes
+from kcal.locate.points import camera_list, own_axes
 from kcal.locate.positions import Located
 from kcal.locate.stereo import Localization, PositionStatus
 from kcal.locate.tables import PositionColumns
@@ -355,9 +355,7 @@ def track_columns(tracks: Tracks, sequence: int, stations: Rig | None = None) ->
             extras[f"velocity_{axis}{part}_mps"] = _texts(along, ok)
     if stations is not None:
         extras["told_from"] = [stations.names[camera] for camera in state.anchor.tolist()]
-        extras["cameras"] = [
-            " ".join(name for name, one in zip(stations.names, row, strict=True) if one) for row in tracks.seen.tolist()
-        ]
+        extras["cameras"] = [camera_list(stations, row) for row in tracks.seen.tolist()]
     names, status = [f"track {number}" for number in tracks.number], state.status.numpy()
     return PositionColumns(
         names, status, [_REASONS[int(code)] for code in status], numbers, extras, state.anchor.numpy()

@@ -272,7 +272,7 @@ class _Compiled:
     def __call__(self, *arguments: Any) -> Any:
         # Other strides would need other code.
         given = [_contiguous(argument) for argument in arguments]
-        tensors = [tensor for argument in given for tensor in _tensors_in(argument)]
+        tensors = [one for part in given if part is not None for one in (part if isinstance(part, tuple) else (part,))]
         if self.free is None:
             every = [(i, axis) for i, tensor in enumerate(tensors) for axis in range(tensor.ndim)]
             self.free = [(i, axis) for i, axis in every if tensors[i].shape[axis] in _STAND_INS]
@@ -281,12 +281,6 @@ class _Compiled:
         if min(tensors[i].shape[axis] for i, axis in self.free) < 2:
             return self.step(*arguments)
         return self.made(*given)
-
-
-def _tensors_in(value: Any) -> tuple[Tensor, ...]:
-    if value is None:
-        return ()
-    return (value,) if isinstance(value, Tensor) else value
 
 
 def _contiguous(value: Any) -> Any:
@@ -552,7 +546,8 @@ class Tracker:
         track, which = close.nonzero(as_tuple=True)
         found = self.steps.score(merged, frame, home, part, when, root, track, which)
         possible = within(found, track, which, self.gates[part.seen.sum(0)[which]])
-        evidence, tiers = zip(*((track.evidence, self._tier(track)) for track in self.records), strict=True)
+        evidence = [track.evidence for track in self.records]
+        tiers = [0 if self._is_told(track) else 1 if track.number == 0 else -1 for track in self.records]
         accepted = sorted(assigned(possible, [ends[i] for i in rows.tolist()], evidence, tiers))
         if not accepted:
             return set()
@@ -573,9 +568,6 @@ class Tracker:
         root = self.shared.root[self.calibration :].unflatten(0, clock.shape[:2])
         unsure = (root[..., None] * clock[:, :, None]).sum(1).square().sum(1).sqrt()
         return imm.Timing(delay, clock, unsure)
-
-    def _tier(self, track: TrackRecord) -> int:
-        return 0 if self._is_told(track) else 1 if track.number == 0 else -1
 
     def _update(
         self,

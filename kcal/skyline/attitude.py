@@ -237,7 +237,8 @@ def attitude_against(
         f". The raster has no horizon in {100 * open_share:.0f} % of the directions around the camera: it ends before "
         "the terrain falls away, or has cells without a height"
     )  # fmt: skip
-    above = _above_ground(raster, place)
+    ground = raster(*torch.tensor([[place.lat], [place.lon]], dtype=torch.float64))
+    above = place.height - float(ground[0])
     if fit is None:
         raise InputError(f"{_CONTRADICTED} no heading fits; {_cure(above)}{gap}")
     return _checked_attitude(fit, found, columns, horizon, border, camera, above, gap)
@@ -251,12 +252,6 @@ def _cure(above: float) -> str:
         f"check the camera's place and height ({above:.0f} m above the raster's ground), the raster's heights "
         "(--geoid) and accuracy, and that the image shows a skyline by day"
     )
-
-
-def _above_ground(raster: Raster, place: Origin) -> float:
-    """Meters of the camera above the raster's ground."""
-    lat, lon = (torch.tensor([part], dtype=torch.float64) for part in (place.lat, place.lon))
-    return place.height - float(raster(lat, lon)[0])
 
 
 def _azimuths(columns: Columns, found: fits.Candidate) -> Floats:
@@ -336,13 +331,11 @@ def _checked_attitude(
 
 def _angles_by_turn(rotation: Floats) -> Floats:
     """(3, 3) degrees of heading, pitch and roll by a turn about the camera's axes, rad."""
-    step, found = 1e-6, np.empty((3, 3))
-    for axis in range(3):
-        ends = []
-        for sign in (1.0, -1.0):
-            turned = fits.rotation_by(sign * step * np.eye(3)[axis]) @ rotation
-            ends.append(np.array(attitude(torch.from_numpy(turned.T.copy()))))
-        found[:, axis] = ((ends[0] - ends[1] + 180.0) % 360.0 - 180.0) / (2.0 * step)
+    step = 1e-6
+    steps = np.concatenate([step * np.eye(3), -step * np.eye(3)])
+    turned = [torch.from_numpy((fits.rotation_by(one) @ rotation).T.copy()) for one in steps]
+    ends = np.stack([attitude(one) for one in turned], -1)
+    found: Floats = ((ends[:, :3] - ends[:, 3:] + 180.0) % 360.0 - 180.0) / (2.0 * step)
     return found
 
 
@@ -446,7 +439,8 @@ def skyline_source(
     error = error or RasterError()
     if not images:
         raise InputError("skyline: no images")
-    eyes = {c: _eye(origin, centers[c]) for c in sorted({image.camera for image in images})}
+    seeing = sorted({image.camera for image in images})
+    eyes = {c: Origin.at(enu_to_geodetic(centers[c][None].double(), origin)[0]) for c in seeing}
     around = {c: functools.cache(functools.partial(horizon_around, raster, eye, error)) for c, eye in eyes.items()}
     found = []
     for image in images:
@@ -460,11 +454,6 @@ def skyline_source(
     return _joined(images, found, cameras, origin, eyes, centers, center_sigma, error), found
 
 
-def _eye(origin: Origin, center: Tensor) -> Origin:
-    lat, lon, height = enu_to_geodetic(center[None].double(), origin)[0].tolist()
-    return Origin(lat=lat, lon=lon, height=height)
-
-
 def _joined(
     images: Sequence[SkylineImage], found: Sequence[SkylineAttitude], cameras: Sequence[Camera], origin: Origin,
     eyes: dict[int, Origin], centers: Tensor, center_sigma: Tensor, error: RasterError,
@@ -472,7 +461,8 @@ def _joined(
     """All images in the rig's frame, whitened together, and in as few rows as there are unknowns."""
     count, sizes = len(cameras), [camera.params.shape[-1] for camera in cameras]
     rotation, center = torch.full((count, 3, 3), math.nan).double(), torch.full((count, 3), math.nan).double()
-    world_from_eye = {c: _world_from_eye(origin, eye) for c, eye in eyes.items()}
+    world = ecef_from_enu_rotation(origin.lat, origin.lon).numpy()
+    world_from_eye = {c: world.T @ ecef_from_enu_rotation(eye.lat, eye.lon).numpy() for c, eye in eyes.items()}
     rows, residual, widened, image_of, seen_of = [], [], [], [], []
     begin = np.cumsum([6 * count, *sizes])
     for number, (image, one) in enumerate(zip(images, found, strict=True)):
@@ -516,9 +506,3 @@ def _joined(
         rms_px=tuple(float(np.sqrt(np.mean(np.square(one.fit.binned.residual)))) for one in found),
         sigmas=tuple(math.sqrt(one.fit.chi2 / max(one.fit.freedom, 1)) for one in found),
     )
-
-
-def _world_from_eye(origin: Origin, eye: Origin) -> Floats:
-    """(3, 3) from east, north, up of an eye to those of the rig's origin."""
-    world, own = (ecef_from_enu_rotation(place.lat, place.lon).numpy() for place in (origin, eye))
-    return world.T @ own

@@ -83,6 +83,12 @@ def candidates(
             f"falls away, {_reach_text(horizon)} from the camera, or has cells without a height; give one that reaches "
             "beyond the hills that are seen"
         )
+
+    def weight(seen: Comparison) -> Floats:
+        """Columns count by what they tell alone, and less the worse they fit."""
+        rough = column_sigma(seen, errors) + np.abs(seen.by_elevation) * _ROUGH * 0.25
+        return seen.known / np.square(rough) / np.square(1.0 + np.square(seen.residual / (3.0 * rough)))
+
     found = []
     for number in _minima(cost, horizon.azimuth):
         psi = horizon.azimuth[number]
@@ -90,7 +96,8 @@ def candidates(
         # A horizon that stands higher by p ahead and q on the right: the camera looks up by p and is rolled by q.
         p, q = tilt[number]
         tilted = rotation_by(np.array([p, -q, 0.0])) @ leveled
-        found.append(_adjusted(some, horizon, (turned @ tilted).T, camera, errors))
+        rotation = _reweighted(some, horizon, (turned @ tilted).T, camera, weight, _HEADING_STEPS, 0.05)
+        found.append(Candidate(rotation, column_cost(compare(some, horizon, rotation, camera), errors, some)))
     return sorted(found, key=lambda one: one.cost)
 
 
@@ -142,17 +149,6 @@ def _minima(cost: Floats, azimuth: Floats) -> list[int]:
         if not found or apart.min() > _APART:
             found.append(int(number))
     return found
-
-
-def _adjusted(columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, errors: SkylineErrors) -> Candidate:
-    """An attitude after some robust steps, all columns counting by what they tell alone."""
-
-    def weight(seen: Comparison) -> Floats:
-        rough = column_sigma(seen, errors) + np.abs(seen.by_elevation) * _ROUGH * 0.25
-        return seen.known / np.square(rough) / np.square(1.0 + np.square(seen.residual / (3.0 * rough)))
-
-    rotation = _reweighted(columns, horizon, rotation, camera, weight, _HEADING_STEPS, 0.05)
-    return Candidate(rotation, column_cost(compare(columns, horizon, rotation, camera), errors, columns))
 
 
 def _reweighted(
@@ -280,8 +276,17 @@ def fit_rotation(
         None if fewer than eight columns agree.
     """
     used = np.ones(len(columns.pixel), dtype=np.bool_)
+
+    def weight(seen: Comparison) -> Floats:
+        """Columns count by what they tell alone; in the first round, less the worse they fit."""
+        sigma = column_sigma(seen, errors)
+        ratio = seen.residual / sigma
+        limit = np.where(ratio > 0, _ABOVE, _FAR_BELOW)
+        soft = used.astype(np.float64) if number else 1.0 / (1.0 + np.square(ratio / limit))
+        return seen.known * soft / np.square(sigma)
+
     for number in range(_ROUNDS):
-        rotation = _robust_rotation(columns, horizon, rotation, camera, errors, used if number else None)
+        rotation = _reweighted(columns, horizon, rotation, camera, weight, _STEPS, math.radians(1.0))
         before, used = used, _columns_that_agree(compare(columns, horizon, rotation, camera), errors, _FAR_BELOW)
         if used.sum() < _LEAST:
             return None
@@ -319,21 +324,6 @@ def fit_rotation(
         float(left @ left),
         len(left) - 3,
     )
-
-
-def _robust_rotation(
-    columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, errors: SkylineErrors, used: Bools | None
-) -> Floats:
-    """A rotation after some steps: columns count by what they tell alone, and less the worse they fit."""
-
-    def weight(seen: Comparison) -> Floats:
-        sigma = column_sigma(seen, errors)
-        ratio = seen.residual / sigma
-        limit = np.where(ratio > 0, _ABOVE, _FAR_BELOW)
-        soft = 1.0 / (1.0 + np.square(ratio / limit)) if used is None else used.astype(np.float64)
-        return seen.known * soft / np.square(sigma)
-
-    return _reweighted(columns, horizon, rotation, camera, weight, _STEPS, math.radians(1.0))
 
 
 def _columns_that_agree(seen: Comparison, errors: SkylineErrors, most_below: float) -> Bools:

@@ -172,23 +172,21 @@ def _refined_border(light: Floats, path: NDArray[np.int64], noise: Floats) -> Bo
     rows, columns = light.shape
     inside = (path >= 2 * _BOX + 1) & (path < rows - 2 * _BOX - 1)
     offset = np.arange(-_REACH, _REACH)
+    at = (offset + 0.5).astype(np.float64)
     # An edge between the rows path - 1 and path stands at path - 0.5.
     index = np.clip(path[:, None] + offset, 0, rows - 1)
     value = light[index, np.arange(columns)[:, None]]
     blur: Floats = np.full(columns, _BLUR)
-    found = None
     for own_blur in (True, False):
-        found = _fit_steps((offset + 0.5).astype(np.float64), value, blur, own_blur=own_blur)
-        good = inside & (np.abs(found[0]) < _MOST_MOVE) & (np.abs(found[1]) > _SURE * noise)
+        place, step, width, variance, left = _fit_steps(at, value, blur, own_blur=own_blur)
+        good = inside & (np.abs(place) < _MOST_MOVE) & (np.abs(step) > _SURE * noise)
         if own_blur:
             # A lens has one blur, and a slanting edge a wider one.
             slope = np.gradient(median_filter(path.astype(np.float64), _MEDIAN, mode="nearest"))
             slant = np.sqrt(1.0 + np.square(slope))
-            usual = float(np.median(found[2][good] / slant[good])) if good.any() else _BLUR
-            vague = found[2] > min(3.0 * usual, _VAGUE) * slant
+            usual = float(np.median(width[good] / slant[good])) if good.any() else _BLUR
+            vague = width > min(3.0 * usual, _VAGUE) * slant
             blur = np.clip(usual, 0.3, _VAGUE) * slant
-    assert found is not None
-    place, step, _, variance, left = found
     # Texture beside the border is no white noise: what it does to the fit is like a step of its own close by.
     texture = np.sqrt(np.maximum(np.square(left) - np.square(noise), 0.0))
     sigma = np.sqrt(variance * np.square(noise) + np.square(_TEXTURE * texture / np.maximum(np.abs(step), 1e-9)))
@@ -387,7 +385,8 @@ def terrain_horizon(raster: Raster, eye: Origin, azimuth: Floats, *, refraction:
             f"the raster has no height at the camera's place ({eye.lat:.5f}, {eye.lon:.5f}); give one that reaches "
             "all around the camera"
         )
-    if eye.height < ground - _depth(raster):
+    # On a slope of one, a place may be below the raster's ground by a quarter of a cell.
+    if eye.height < ground - max(5.0, 0.25 * raster.cell_m):
         raise InputError(
             f"the camera stands {ground - eye.height:.1f} m below the raster's ground; is its height above the "
             "ellipsoid, as the raster's is? The height of the geoid (--geoid) is added to a raster of heights above "
@@ -409,11 +408,6 @@ def sample_distances(raster: Raster, rays: TerrainRays) -> Floats:
     """(S,) meters, half a cell apart, at which the ground is sampled."""
     step = 0.5 * raster.cell_m
     return np.arange(_NEAREST * raster.cell_m, rays.farthest + step, step)
-
-
-def _depth(raster: Raster) -> float:
-    """Meters by which a place may be below the raster's ground: on a slope of one, a quarter of a cell."""
-    return max(5.0, 0.25 * raster.cell_m)
 
 
 class TerrainRays:
@@ -649,5 +643,4 @@ def columns_of(row: Floats, sigma: Floats, camera: Camera) -> Columns:
     clear = np.isfinite(row)
     pixel = np.stack([np.flatnonzero(clear).astype(np.float64), row[clear]], -1)
     rays, valid = camera.unproject(torch.from_numpy(pixel))
-    found = Columns(pixel, sigma[clear], rays.numpy())
-    return found.some(valid.numpy())
+    return Columns(pixel, sigma[clear], rays.numpy()).some(valid.numpy())

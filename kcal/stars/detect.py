@@ -186,15 +186,11 @@ def _uncrowded(pixels: Floats, peak: Floats) -> NDArray[np.bool_]:
     """(N,) whether no other point of light of a twentieth of the brightness or more is near."""
     from scipy.spatial import cKDTree
 
-    known = np.isfinite(pixels).all(1)
+    index = np.flatnonzero(np.isfinite(pixels).all(1))
+    pairs = index[cKDTree(pixels[index]).query_pairs(_CROWDED, output_type="ndarray")]
+    first, second = np.concatenate([pairs, pairs[:, ::-1]]).T
     alone = np.ones(len(pixels), bool)
-    index = np.flatnonzero(known)
-    if len(index) < 2:
-        return alone
-    pairs = cKDTree(pixels[index]).query_pairs(_CROWDED, output_type="ndarray")
-    for first, second in ((pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])):
-        near = index[first][peak[index[second]] > 0.05 * peak[index[first]]]
-        alone[near] = False
+    alone[first[peak[second] > 0.05 * peak[first]]] = False
     return alone
 
 

@@ -243,11 +243,9 @@ def _agreement_with(stars: Tensor, change: Tensor, lens: CameraInformation, coun
     squares = ((left.T @ residual).square() / (1.0 + told.square()))[use]
     chi2, freedom = float(squares.sum()), int(use.sum())
     # A change of focus is one direction, which the sum over many that agree would hide.
-    by_chance = (
-        min(float(stats.chi2.sf(chi2, freedom)), freedom * float(stats.chi2.sf(float(squares.max()), 1)))
-        if freedom
-        else 1.0
-    )
+    by_chance = 1.0
+    if freedom:
+        by_chance = min(float(stats.chi2.sf(chi2, freedom)), freedom * float(stats.chi2.sf(float(squares.max()), 1)))
     return Agreement(
         chi2=chi2,
         freedom=freedom,
@@ -335,8 +333,25 @@ def calibrate_by_stars(
     catalog = catalog or StarCatalog.bundled()
     order = sorted(range(len(images)), key=lambda number: -len(images[number].pixels))
     rotations: dict[int, np.ndarray] = {}
+
+    def fitted(
+        camera: Camera, rotations: dict[int, np.ndarray], share: float = math.inf
+    ) -> tuple[StarLens, Agreement | None, dict[int, _StarImage]]:
+        """The lens from stars within a share of the half diagonal, its agreement with boards, and the stars."""
+        near = {number: _near_middle(images[number], size, share) for number in rotations}
+        seen = _star_fields(near, views, camera, rotations, catalog)
+        fields, turns = [one.field for one in seen.values()], [one.rotation for one in seen.values()]
+        if boards is not None:
+            return *refine_by_stars(fields, turns, boards), seen
+        return fit_star_lens(fields, turns, size, float(camera.params[0])), None, seen
+
     if boards is None:
-        camera, rotations = _first_lens(images, views, order, _plain_cameras(size, focal), catalog, progress)
+        camera, rotations = _first_lens(images, order, _plain_cameras(size, focal), catalog, progress)
+        # Stars get names from the middle outward while the lens becomes better known.
+        for share in (0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.2) if camera.model.fisheye else (0.6, 0.8, 1.0, 1.2):
+            lens, _, seen = fitted(camera, rotations, share)
+            camera = lens.camera
+            rotations = {n: found.numpy() for n, found in zip(seen, lens.rotations, strict=True)}
     else:
         camera = boards.camera
         if camera.size != size:
@@ -354,19 +369,11 @@ def calibrate_by_stars(
     progress("names")
     if not rotations:
         raise InputError(f"in none of {len(images)} images stars have names by the boards' camera: is it of this lens?")
-    lens: StarLens | None = None
-    agreement: Agreement | None = None
     for _ in range(3):
-        seen = _star_fields(images, views, camera, rotations, catalog)
-        fields, turns = [one.field for one in seen.values()], [one.rotation for one in seen.values()]
-        if boards is None:
-            lens = fit_star_lens(fields, turns, size, float(camera.params[0]))
-        else:
-            lens, agreement = refine_by_stars(fields, turns, boards)
+        lens, agreement, seen = fitted(camera, rotations)
         camera = lens.camera
         rotations = {n: found.numpy() for n, found in zip(seen, lens.rotations, strict=True)}
         progress("lens")
-    assert lens is not None
     return StarCamera(
         lens=lens,
         images=tuple(seen),
@@ -380,7 +387,6 @@ def calibrate_by_stars(
 
 def _first_lens(
     images: Sequence[DetectedStars],
-    views: Sequence[SkyView],
     order: Sequence[int],
     cameras: Sequence[Camera],
     catalog: StarCatalog,
@@ -394,7 +400,7 @@ def _first_lens(
         found = _search(images[number], cameras, corners, catalog, progress, what)
         if found is not None:
             named, camera = found
-            return _from_middle_outward(images, views, camera, {number: named.rotation}, catalog)
+            return camera, {number: named.rotation}
     raise InputError(
         f"in none of {len(images)} images stars have names: too few are seen, this is not the night sky, or its "
         f"diagonal field of view is not {_NARROWEST:g} to {_WIDEST:g} degrees: start from a camera file (--camera)"
@@ -463,26 +469,6 @@ def _by_camera(found: DetectedStars, camera: Camera, catalog: StarCatalog) -> Id
     return identify(rays[valid].numpy(), _ROUGH_PX / focal, catalog=catalog, scale_error=0.003)
 
 
-def _from_middle_outward(
-    images: Sequence[DetectedStars],
-    views: Sequence[SkyView],
-    camera: Camera,
-    rotations: dict[int, np.ndarray],
-    catalog: StarCatalog,
-) -> tuple[Camera, dict[int, np.ndarray]]:
-    """A camera from one image, whose stars get names from the middle outward while the lens becomes better known."""
-    assert camera.size is not None
-    size = camera.size
-    for share in (0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.2) if camera.model.fisheye else (0.6, 0.8, 1.0, 1.2):
-        near = {n: _near_middle(images[n], size, share) for n in rotations}
-        seen = _star_fields(near, views, camera, rotations, catalog)
-        fields, turns = [one.field for one in seen.values()], [one.rotation for one in seen.values()]
-        lens = fit_star_lens(fields, turns, size, float(camera.params[0]))
-        camera = lens.camera
-        rotations = {n: found.numpy() for n, found in zip(seen, lens.rotations, strict=True)}
-    return camera, rotations
-
-
 def _near_middle(found: DetectedStars, size: tuple[int, int], share: float) -> DetectedStars:
     away = np.linalg.norm(found.pixels - [(size[0] - 1) / 2, (size[1] - 1) / 2], axis=1)
     use = away < share * 0.5 * math.hypot(*size)
@@ -498,7 +484,7 @@ class _StarImage(NamedTuple):
 
 
 def _star_fields(
-    images: Sequence[DetectedStars] | dict[int, DetectedStars],
+    images: dict[int, DetectedStars],
     views: Sequence[SkyView],
     camera: Camera,
     rotations: dict[int, np.ndarray],

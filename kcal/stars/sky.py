@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
 import functools
@@ -365,10 +366,14 @@ def _table_of(catalog: StarCatalog, degrees: float, folder: Path) -> PairTable:
     content = hashlib.sha256(directions.tobytes()).hexdigest()[:12]
     path = folder / f"stars-{_VERSION}-{content}-{degrees:g}.npz"
     found = _table_on_disk(path)
+    pairs, angle, stars = found or _close_pairs(directions, np.radians(degrees))
     if found is None:
-        found = _close_pairs(directions, np.radians(degrees))
-        _keep_table(path, found)
-    pairs, angle, stars = found
+        data = io.BytesIO()
+        np.savez(data, pairs=pairs, angle=angle, stars=np.array(stars))
+        # A home that cannot be written costs a second each time, no more.
+        with contextlib.suppress(FileError):
+            make_folder(path.parent)
+            write_atomic(path, data.getvalue(), told=False)
     both = np.stack([pairs, pairs[:, ::-1]], 1).reshape(-1, 2)
     return PairTable(order, directions, both, np.repeat(angle, 2), stars)
 
@@ -396,17 +401,6 @@ def _table_on_disk(path: Path) -> _Pairs | None:
         return None
     whole = pairs.ndim == 2 and pairs.shape == (len(angle), 2) and pairs.dtype == np.uint16 and stars > 0
     return (pairs, angle, stars) if whole and (np.diff(angle) >= 0).all() and pairs.max(initial=0) < stars else None
-
-
-def _keep_table(path: Path, table: _Pairs) -> None:
-    pairs, angle, stars = table
-    data = io.BytesIO()
-    np.savez(data, pairs=pairs, angle=angle, stars=np.array(stars))
-    try:
-        make_folder(path.parent)
-        write_atomic(path, data.getvalue(), told=False)
-    except FileError:
-        return  # a home that cannot be written costs a second each time, no more
 
 
 # Name stars without knowing where the camera looks, from the angles between the brightest of them.

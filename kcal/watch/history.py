@@ -331,7 +331,9 @@ def smoothed(states: list[TurnState], times: list[float], model: TurnModel) -> l
     for k in range(len(states) - 2, -1, -1):
         later, here = found[k + 1], states[k]
         prior, keep = passed(here, torch.tensor(times[k + 1] - times[k], dtype=torch.float64), model)
-        if bool(states[k + 1].strikes == 0) and bool(here.strikes > 0) and _jumped(states[k + 1], prior):
+        move = (states[k + 1].mean - prior.mean)[_SLOW].abs()
+        jumped = bool((move > 4.0 * prior.covariance.diagonal()[_SLOW].sqrt()).any())
+        if jumped and bool(states[k + 1].strikes == 0) and bool(here.strikes > 0):
             # Believed after doubts: what came after the jump tells nothing of before.
             continue
         gain = torch.linalg.solve(prior.covariance + 1e-24 * torch.eye(SIZE, dtype=torch.float64),
@@ -340,11 +342,6 @@ def smoothed(states: list[TurnState], times: list[float], model: TurnModel) -> l
         covariance = here.covariance + gain @ (later.covariance - prior.covariance) @ gain.mT
         found[k] = here._replace(mean=mean, covariance=0.5 * (covariance + covariance.mT))
     return found
-
-
-def _jumped(after: TurnState, prior: TurnState) -> bool:
-    move = (after.mean - prior.mean)[_SLOW]
-    return bool((move.abs() > 4.0 * prior.covariance.diagonal()[_SLOW].sqrt()).any())
 
 
 # Tables that grow while they are read: the history of a watched rig, and temperatures.
@@ -428,9 +425,8 @@ _TURN = tuple(f"{side}_{name}_deg" for side in _SIDES for name in _ANGLES)
 _BETWEEN = tuple(f"between_{k}_deg" for k in range(5))
 
 
-def _upper(size: int) -> tuple[Tensor, Tensor]:
-    rows, columns = torch.triu_indices(size, size)
-    return rows, columns
+def _upper(size: int) -> tuple[Tensor, ...]:
+    return torch.triu_indices(size, size).unbind()
 
 
 _TURN_COVARIANCE = tuple(f"{side}_cov_{i}{j}_deg2" for side in _SIDES for i in range(3) for j in range(i, 3))

@@ -26,10 +26,10 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import fit_turn, rotation_from_vector, seen_turned, vector_from_rotation
 from kcal.lens.projection import FAR
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig
-from kcal.locate.budget import usual_ranges
+from kcal.locate.budget import measured_ranges, right_turned, usual_ranges
 from kcal.locate.marks import Marks
 from kcal.locate.mounting import attitude
-from kcal.locate.stereo import PositionStatus, sight_lines
+from kcal.locate.stereo import sight_lines
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief
 from kcal.threads import in_one_thread
@@ -108,8 +108,10 @@ def camera_turns(
             "check names, the sigma of the marks and that the images are of these cameras"
         )
     used = torch.zeros_like(matched)
+    limit = chi2_quantile(2.0, 1.0 - adjustment.FALSE_ALARM / int(known.sum()))
     for _ in range(_ROUNDS):
-        over = torch.stack([_over_limit(turn, known) for turn in found]).amax(0)
+        # What is typical of a camera counts as its noise.
+        over = torch.stack([turn.squares / (max(1.0, _typical(turn)) * limit) for turn in found]).amax(0)
         before, used = used, matched & (over <= 1.0)
         if torch.equal(before, used):
             break
@@ -175,12 +177,6 @@ class _MarksTwice:
 def _typical(turn: CameraTurn) -> float:
     """How much larger χ² typically is than the sigma of the marks says."""
     return typical_ratio(turn.squares, 2.0 * torch.isfinite(turn.off).all(-1))
-
-
-def _over_limit(turn: CameraTurn, known: Tensor) -> Tensor:
-    """(F,) χ² of each mark over the largest that noise explains; what is typical of a camera counts as its noise."""
-    level = 1.0 - adjustment.FALSE_ALARM / int(known.sum())
-    return turn.squares / (max(1.0, _typical(turn)) * chi2_quantile(2.0, level))
 
 
 # Measure how the cameras of a rig have turned since it was solved, from points that do not move (`kcal rig check`).
@@ -283,12 +279,11 @@ class Drift:
             right, beside = new.right.project(new.right_from_left(points))
             if not bool((ahead & beside).all()):
                 raise InputError("the cameras do not look the same way: the effect of a drift cannot be computed")
-            lines = sight_lines(old, left, right)
-            found = torch.linalg.vector_norm(lines.points, dim=-1)
+            found = measured_ranges(old, right, left)
             # Turning the right camera by ω about its x, y, z moves a point's image; the range follows the disparity.
             rows = torch.stack([_range_slope(new, points, axis) for axis in torch.eye(3, dtype=torch.float64)], -1)
         sigma = (rows @ self.relative_covariance * rows).sum(-1).clamp_min(0.0).sqrt()
-        return DriftEffect(far, torch.where(lines.status == int(PositionStatus.OK), found, math.inf), sigma)
+        return DriftEffect(far, found, sigma)
 
     @in_one_thread
     def relocked(self, note: str) -> Rig:
@@ -341,11 +336,7 @@ def _range_slope(rig: Rig, points: Tensor, axis: Tensor) -> Tensor:
     """Meters of range by a radian of the right camera about one of its axes (3,)."""
     ends = []
     for step in (-1e-8, 1e-8):
-        turn = rotation_from_vector(step * axis)
-        turned = Rig.pair(
-            rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation
-        )
-        left, right = turned(points)[0].unbind(-2)
+        left, right = right_turned(rig, step * axis)(points)[0].unbind(-2)
         ends.append(torch.linalg.vector_norm(sight_lines(rig, left, right).points, dim=-1))
     return (ends[1] - ends[0]) / 2e-8
 
@@ -401,11 +392,63 @@ def measure_drift(
         raise InputError("drift: features or landmarks are needed")
     if landmarks is not None and pose is None:
         raise InputError("drift: landmarks need the left camera's pose in their frame")
-    if features is None or not bool(torch.isfinite(features.pixels[:, :2]).all(-1).any()):
-        return _against(rig, features, landmarks, pose, before, refraction)
-    if landmarks is not None:
-        raise InputError("drift: features with marks then tell the turn without errors of a survey; give either")
-    return _since(rig, features, None if pose is None else as_points("pose rotation", pose[0], 3))
+    if features is not None and bool(torch.isfinite(features.pixels[:, :2]).all(-1).any()):
+        if landmarks is not None:
+            raise InputError("drift: features with marks then tell the turn without errors of a survey; give either")
+        return _since(rig, features, None if pose is None else as_points("pose rotation", pose[0], 3))
+    # How the cameras stand now against how the rig was solved, from landmarks or features of known range. Without
+    # landmarks the left camera holds the frame.
+    loose = landmarks is not None
+    rotation, center = pose or (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    rotation, center = as_points("pose rotation", rotation, 3), as_points("pose center", center, 3)
+    right_center = center - rotation.T @ rig.right_from_left_rotation.T @ rig.right_from_left_translation
+    start = Start(
+        rotation=torch.stack([rotation, rig.right_from_left_rotation @ rotation]),
+        center=torch.stack([center, right_center]),
+    )
+    if features is not None:
+        features = dataclasses.replace(features, pixels=features.pixels[:, 2:])
+    cameras = (rig.left, rig.right)
+    data = RigData(cameras=cameras, names=_NAMES, features=features, landmarks=landmarks)
+    unknowns = held(cameras).and_refraction(*refraction) if loose else held(cameras)
+    work = adjustment.Adjustment(data, start, unknowns, 1.0, turning=[loose, True], moving=[False] * 2)
+    mask = _telling(data)
+    reasons = dict.fromkeys((~mask).nonzero()[:, 0].tolist(), "too few of the images have a mark of it")
+    if int(mask.sum()) < 2:
+        raise DegenerateError("drift: two features or landmarks at least are needed; more let wrong ones be found")
+    work.solve(mask, adjustment.ROUGHLY, adjustment.LOSS)
+    mask = adjustment.without_wrong(work, mask, _SOLVER)
+    problem, _ = work.solve(mask, _SOLVER)
+    state = work.part(mask)
+    fit = goodness_of_fit(problem, state)
+    known = RigSolution(problem, state, fit.variance)
+    covariance, determined = known.of(known.relative_rows(0, 1))
+    if not bool(determined[:3].all()):
+        left_open = "; ".join(known.open_directions(_NAMES, absolute=True))
+        raise DegenerateError(f"drift: what was seen does not determine how the cameras have turned ({left_open})")
+    relative = state.rotation[1] @ state.rotation[0].T
+    drift = vector_from_rotation(relative @ rig.right_from_left_rotation.T)
+    own = [vector_from_rotation(now @ then.T) for now, then in zip(state.rotation, start.rotation, strict=True)]
+    alone = [known.of(known.turn_rows(c))[0] for c in (0, 1)]
+    compared = covariance[:3, :3]
+    if before is not None:
+        compared = compared + before[0]
+        alone = [alone[0] + before[1], alone[1] + before[0] + relative @ before[1] @ relative.T]
+    return Drift(
+        left=own[0] if loose else None,
+        right=own[1] if loose else None,
+        relative=drift,
+        left_covariance=alone[0] if loose else None,
+        right_covariance=alone[1] if loose else None,
+        relative_covariance=compared,
+        chi2=float(drift @ torch.linalg.solve(compared, drift)),
+        old=rig,
+        rig=Rig.pair(rig.left, rig.right, relative, state.rotation[1] @ (state.center[0] - state.center[1])),
+        pose_covariance=covariance,
+        cam_from_local=state.rotation[0] if pose is not None else None,
+        items=records(work, mask, reasons).items,
+        variance=fit.variance,
+    )
 
 
 def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift:
@@ -486,69 +529,6 @@ def drift_of_turns(
     )
 
 
-def _against(
-    rig: Rig,
-    features: Features | None,
-    landmarks: Landmarks | None,
-    pose: tuple[Tensor, Tensor] | None,
-    before: tuple[Tensor, Tensor] | None,
-    refraction: tuple[float, float],
-) -> Drift:
-    """How the cameras stand now against how the rig was solved, from landmarks or features of known range."""
-    # Without landmarks the left camera holds the frame.
-    loose = landmarks is not None
-    rotation, center = pose or (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
-    rotation, center = as_points("pose rotation", rotation, 3), as_points("pose center", center, 3)
-    right_center = center - rotation.T @ rig.right_from_left_rotation.T @ rig.right_from_left_translation
-    start = Start(
-        rotation=torch.stack([rotation, rig.right_from_left_rotation @ rotation]),
-        center=torch.stack([center, right_center]),
-    )
-    if features is not None:
-        features = dataclasses.replace(features, pixels=features.pixels[:, 2:])
-    cameras = (rig.left, rig.right)
-    data = RigData(cameras=cameras, names=_NAMES, features=features, landmarks=landmarks)
-    unknowns = held(cameras).and_refraction(*refraction) if loose else held(cameras)
-    work = adjustment.Adjustment(data, start, unknowns, 1.0, turning=[loose, True], moving=[False] * 2)
-    mask = _telling(data)
-    reasons = dict.fromkeys((~mask).nonzero()[:, 0].tolist(), "too few of the images have a mark of it")
-    if int(mask.sum()) < 2:
-        raise DegenerateError("drift: two features or landmarks at least are needed; more let wrong ones be found")
-    work.solve(mask, adjustment.ROUGHLY, adjustment.LOSS)
-    mask = adjustment.without_wrong(work, mask, _SOLVER)
-    problem, _ = work.solve(mask, _SOLVER)
-    state = work.part(mask)
-    fit = goodness_of_fit(problem, state)
-    known = RigSolution(problem, state, fit.variance)
-    covariance, determined = known.of(known.relative_rows(0, 1))
-    if not bool(determined[:3].all()):
-        left_open = "; ".join(known.open_directions(_NAMES, absolute=True))
-        raise DegenerateError(f"drift: what was seen does not determine how the cameras have turned ({left_open})")
-    relative = state.rotation[1] @ state.rotation[0].T
-    drift = vector_from_rotation(relative @ rig.right_from_left_rotation.T)
-    own = [vector_from_rotation(now @ then.T) for now, then in zip(state.rotation, start.rotation, strict=True)]
-    alone = [known.of(known.turn_rows(c))[0] for c in (0, 1)]
-    compared = covariance[:3, :3]
-    if before is not None:
-        compared = compared + before[0]
-        alone = [alone[0] + before[1], alone[1] + before[0] + relative @ before[1] @ relative.T]
-    return Drift(
-        left=own[0] if loose else None,
-        right=own[1] if loose else None,
-        relative=drift,
-        left_covariance=alone[0] if loose else None,
-        right_covariance=alone[1] if loose else None,
-        relative_covariance=compared,
-        chi2=float(drift @ torch.linalg.solve(compared, drift)),
-        old=rig,
-        rig=Rig.pair(rig.left, rig.right, relative, state.rotation[1] @ (state.center[0] - state.center[1])),
-        pose_covariance=covariance,
-        cam_from_local=state.rotation[0] if pose is not None else None,
-        items=records(work, mask, reasons).items,
-        variance=fit.variance,
-    )
-
-
 def _telling(data: RigData) -> Tensor:
     """Which landmarks have a mark, and which features of known range both cameras see."""
     found = [torch.zeros(0, dtype=torch.bool)]
@@ -586,8 +566,7 @@ def check_rig(rig: Rig, *, features: Features | None = None, landmarks: Landmark
     pose: tuple[Tensor, Tensor] | None = None
     left = torch.zeros(3, 3, dtype=torch.float64)
     refraction = REFRACTION, REFRACTION_SIGMA
-    if rig.mounting is not None:
-        stands = rig.mounting
+    if (stands := rig.mounting) is not None:
         rotation = stands.enu_from_cam.T
         pose = rotation, torch.zeros(3, dtype=torch.float64)
         if stands.covariance is not None:

@@ -88,13 +88,12 @@ class Watched:
         Raises:
             InputError: it is not later than the last one.
         """
-        if self.times and not row.time > self.times[-1]:
-            raise InputError(f"time {row.time:g}: not after that of the last measurement, {self.times[-1]:g}")
+        state = past.first_state(self.model)
         if self.times:
+            if not row.time > self.times[-1]:
+                raise InputError(f"time {row.time:g}: not after that of the last measurement, {self.times[-1]:g}")
             gap = torch.tensor(row.time - self.times[-1], dtype=torch.float64)
             state, _ = past.passed(self.states[-1], gap, self.model)
-        else:
-            state = past.first_state(self.model)
         self.times.append(row.time)
         self.states.append(past.taken(state, row.look, self.model, self.between))
         self.seen.append(bool(row.look.seen.all()))
