@@ -10,6 +10,7 @@ import datetime
 import math
 import re
 from typing import NamedTuple
+from urllib.parse import SplitResult, urlsplit
 
 from kcal.errors import InputError
 
@@ -204,3 +205,18 @@ def _number_or_nan(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
+
+
+def split_address(text: str) -> SplitResult:
+    """The parts of SCHEME://HOST:PORT/PATH; all empty where brackets or the port are none.
+
+    Example:
+        >>> split_address("udp://127.0.0.1:18999").port, split_address("udp://[::1:5").hostname
+        (18999, None)
+    """
+    try:
+        parts = urlsplit(text)
+        # Asked for, a port beyond 65535 is an error.
+        return parts if parts.port != 0 else urlsplit("")
+    except ValueError:
+        return urlsplit("")

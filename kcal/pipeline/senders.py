@@ -15,7 +15,6 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from typing import Any, Protocol
-from urllib.parse import urlsplit
 
 import numpy as np
 import orjson
@@ -30,6 +29,7 @@ from kcal.locate.export import cot_events, point_features
 from kcal.locate.positions import CORNER_DECIMALS, Located, camera_place, field_of_view, near, ring_blocks
 from kcal.locate.tables import PositionColumns
 from kcal.texts import length_text, number_text
+from kcal.values import split_address
 from kcal.web.coast import coast_near
 from kcal.web.serving import LocalServer, local_app, page_files
 
@@ -68,12 +68,10 @@ class CotSender:
     """
 
     def __init__(self, address: str, stale_s: float = 10.0) -> None:
-        parts, port = urlsplit(address), None
-        with contextlib.suppress(ValueError):
-            port = parts.port
-        if parts.scheme not in ("udp", "tcp") or not parts.hostname or not port or parts.path:
+        parts = split_address(address)
+        if parts.scheme not in ("udp", "tcp") or not parts.hostname or not parts.port or parts.path:
             raise InputError(f"{_without_password(address)}: write udp://HOST:PORT or tcp://HOST:PORT")
-        self._tcp, self._target = parts.scheme == "tcp", (parts.hostname, port)
+        self._tcp, self._target = parts.scheme == "tcp", (parts.hostname, parts.port)
         self._stale_s, self._socket, self._next_try = stale_s, None, 0.0
         self.failed = 0
 
@@ -127,7 +125,7 @@ class MqttSender:
     def __init__(self, address: str) -> None:
         with with_extra("mqtt", "MQTT needs"):
             from paho.mqtt import client, enums
-        parts = urlsplit(address)
+        parts = split_address(address)
         self._topic = parts.path.strip("/")
         if parts.scheme != "mqtt" or not parts.hostname or not self._topic or set(self._topic) & set("#+"):
             raise InputError(f"{_without_password(address)}: write mqtt://HOST/TOPIC")

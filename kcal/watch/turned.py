@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import re
@@ -638,16 +639,15 @@ def parse_aging(text: str, name: str) -> float:
         >>> parse_aging("9h:0.0004,8K:0.0002", "--aged"), parse_aging("4h:0.001", "--aged")
         (0.002, 0.002)
     """
-    known: dict[str, tuple[float, float]] = {}
-    for part in text.split(","):
-        found = _PART.fullmatch(part.strip())
-        try:
-            count, unit, degrees = found.groups()  # type: ignore[union-attr]
+    parts, known = [_PART.fullmatch(part.strip()) for part in text.split(",")], dict[str, tuple[float, float]]()
+    with contextlib.suppress(AttributeError, ValueError):
+        for count, unit, degrees in (found.groups() for found in parts):  # type: ignore[union-attr]
             known[unit] = float(count), float(degrees)
-        except (AttributeError, ValueError):
-            raise InputError(
-                f"{name} {text}: write hours and degrees in an hour, kelvin and degrees per kelvin, like "
-                "9h:0.0004,8K:0.0002"
-            ) from None
+    # A unit that is given twice is as wrong as none.
+    if len(known) < len(parts):
+        raise InputError(
+            f"{name} {text}: write hours and degrees in an hour, kelvin and degrees per kelvin, like "
+            "9h:0.0004,8K:0.0002"
+        )
     (hours, per_hour), (kelvin, per_kelvin) = known.get("h", (0.0, 0.0)), known.get("K", (0.0, 0.0))
     return forgotten_yaw(hours=hours, per_hour=per_hour, kelvin=kelvin, per_kelvin=per_kelvin)

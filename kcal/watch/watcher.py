@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from http.client import HTTPException
 from pathlib import Path
 from typing import NamedTuple, Self
-from urllib.parse import urlsplit
 
 import numpy as np
 import torch
@@ -28,6 +27,7 @@ from kcal.locate.marks import Marks
 from kcal.locate.points import PointLocator
 from kcal.locate.tables import PositionColumns
 from kcal.pipeline.stream import Ledger
+from kcal.values import split_address
 from kcal.watch.turned import Drift, drift_of_turns
 
 # `Watched`: a rig and the history of its attitude; the rig of any time, with the errors of that time.
@@ -177,8 +177,9 @@ def relock(watched: Watched) -> Relock:
     A new file is used without the watch: its covariance contains the swing. It must explain the last
     measurements, which take no part in the mean, better than the old one.
     """
-    if not watched.times or watched.times[-1] - watched.times[0] < _DAY:
-        return Relock(None, "a day of history is needed, so that a swing is not taken for a drift")
+    if len(watched.times) <= _HELD_OUT or watched.times[-1] - watched.times[0] < _DAY:
+        need = f"a day of history and more than {_HELD_OUT} measurements are needed"
+        return Relock(None, f"{need}, so that a swing is not taken for a drift")
     end = watched.times[-_HELD_OUT - 1]
     chosen = [end - _DAY * k / 48.0 for k in range(48)]
     turns = [watched.turns_at(time, gusts=False) for time in chosen if time >= watched.times[0]]
@@ -300,13 +301,14 @@ def located_at(history: Path, rig: Rig, locator: Callable[[Rig], PointLocator]) 
 def alarm_sigmas(every_s: float) -> float:
     """Standard deviations by which a limit must be exceeded, for less than one false alarm a month.
 
-    Three angles and two signs are measured every so many seconds; agreement of measurements makes it rarer.
+    Three angles and two signs are measured every so many seconds; agreement of measurements makes it rarer. What is
+    measured less than once a day is judged as if it were.
 
     Example:
         >>> round(alarm_sigmas(60.0), 2)
         4.47
     """
-    tries = 6.0 * _MONTH / every_s
+    tries = 6.0 * _MONTH / min(every_s, _DAY)
     return math.sqrt(2.0) * float(torch.erfinv(torch.tensor(1.0 - 2.0 / tries, dtype=torch.float64)))
 
 
@@ -326,7 +328,8 @@ class Webhook:
     """
 
     def __init__(self, address: str) -> None:
-        if urlsplit(address).scheme not in ("http", "https") or not urlsplit(address).hostname:
+        parts = split_address(address)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
             raise InputError("--alarm: write http://... or https://..., or exit")
         self.address, self.failed, self._waiting = address, 0, b""
 

@@ -18,6 +18,7 @@ from waiting import PATIENCE
 
 import kcal.watch.watcher as watcher_module
 from kcal.cli.main import app
+from kcal.errors import InputError
 from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.rig import Mounting, Origin
 from kcal.locate.budget import planned_rig
@@ -190,6 +191,12 @@ def test_a_webhook_gets_the_alarm_and_is_tried_again(monkeypatch: pytest.MonkeyP
     hook.again()
     server.shutdown()
     assert (hook.failed, got) == (1, [{"time": 1.0}])
+
+
+@pytest.mark.parametrize("address", ["udp://host", "http://[::1", "http://host:99999"])
+def test_impossible_webhooks(address: str) -> None:
+    with pytest.raises(InputError, match="write http"):
+        Webhook(address)
 
 
 def test_a_webhook_that_speaks_no_http_ends_nothing() -> None:

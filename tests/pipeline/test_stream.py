@@ -308,7 +308,16 @@ def test_a_receiver_that_is_not_there_is_counted(whole: tuple[Path, dict[str, by
 
 
 @pytest.mark.parametrize(
-    "wrong", ["http://host:1", "udp://host", "tcp://host:x", "udp://user:secret@:1", "mqtt://host"]
+    "wrong",
+    [
+        "http://host:1",
+        "udp://host",
+        "tcp://host:x",
+        "udp://user:secret@:1",
+        "udp://[::1:5",
+        "mqtt://host",
+        "mqtt://host:99999/x",
+    ],
 )
 def test_impossible_addresses(wrong: str) -> None:
     with pytest.raises(InputError, match="write ") as caught:

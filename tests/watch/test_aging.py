@@ -16,7 +16,7 @@ def test_time_is_a_random_walk_and_temperature_is_not() -> None:
     assert parse_aging("4h:0.001, 4K:0.001", "--aged") == pytest.approx(math.hypot(0.002, 0.004))
 
 
-@pytest.mark.parametrize("text", ["4h", "4:0.001", "4h:", "4h:-0.001", "4h:1e999", "x"])
+@pytest.mark.parametrize("text", ["4h", "4:0.001", "4h:", "4h:-0.001", "4h:1e999", "x", "9h:0.1,4h:0.2"])
 def test_what_is_no_aging(text: str) -> None:
     with pytest.raises(InputError, match=r"write hours|from 0 on"):
         parse_aging(text, "--aged")

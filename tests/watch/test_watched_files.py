@@ -194,6 +194,8 @@ def test_alarms_need_a_limit_surely_passed() -> None:
     assert exceeded(turn, sure, 0.005, 60.0).tolist() == [False, True, False]
     assert not bool(exceeded(turn, sure * 1.02, 0.005, 60.0).any())
     assert bool(exceeded(-turn, sure, 0.005, 60.0).any())
+    # Measured once a year, a limit can still be passed.
+    assert bool(exceeded(turn, 0.1 * sure, 0.005, 3e7).any())
 
 
 def test_temperatures_of_a_growing_table(tmp_path: Path) -> None:
@@ -229,6 +231,8 @@ def day(yaw: float, swing: float, hours: int = 30) -> Watched:
 
 def test_relock_never_makes_a_good_rig_worse() -> None:
     assert "a day of history" in relock(day(0.02, 0.0, 20)).reason
+    rare = Watched(RIG, [row_of(7200.0 * k, yaw_turn(0.02)) for k in range(20)], steady_model(0.003, 3.0, 0.0003))
+    assert "more than 20 measurements" in relock(rare).reason
     good = relock(day(0.0, 0.005))
     assert good.rig is None
     assert "does not differ" in good.reason
