@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any, ClassVar
+from unittest.mock import Mock
 
 import pydantic
 import pytest
@@ -54,11 +55,7 @@ class TestWriteAtomic:
     ) -> None:
         path = tmp_path / "a.txt"
         write_atomic(path, "old")
-
-        def full(*_: object) -> None:
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(os, "fsync", full)
+        monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(28, "No space left on device")))
         with pytest.raises(FileError, match=r"a\.txt: cannot write: No space left"):
             write_atomic(path, "new")
         assert path.read_text() == "old"
@@ -93,10 +90,8 @@ class TestWriteAtomic:
         assert {file.name for file in (tmp_path / "real").iterdir()} == {"a.txt", "b.txt"}
 
     def test_the_umask_is_never_changed(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        def changed(_: int) -> int:
-            raise AssertionError("other threads would create files with this umask")
-
-        monkeypatch.setattr(os, "umask", changed)
+        changed = AssertionError("other threads would create files with this umask")
+        monkeypatch.setattr(os, "umask", Mock(side_effect=changed))
         assert write_atomic(tmp_path / "a.txt", "x").read_text() == "x"
 
     def test_long_names(self, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -275,9 +276,7 @@ class TestRig:
 
     @pytest.mark.slow
     def test_a_failure_leaves_no_file(self, folder: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
-        def fails(*_: object) -> None:
-            raise DegenerateError("no side of a square could be triangulated")
-
+        fails = Mock(side_effect=DegenerateError("no side of a square could be triangulated"))
         monkeypatch.setattr("kcal.report.judge_rig.triangulated_sides", fails)
         arguments = f"rig left.camera.json right.camera.json {PAIRS} -o rig.json"
         assert "no side of a square" in command.refuses(arguments)

@@ -7,6 +7,7 @@ import shlex
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -142,12 +143,9 @@ def test_what_comes_next_is_said_step_by_step(folder: Path, capsys: pytest.Captu
 def test_without_the_extra_for_videos_the_rest_is_made(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def missing(*arguments: Any) -> None:
-        raise ImportError(name="av")
-
     (folder / "video" / "left.mp4").unlink()
     (folder / "survey.csv").unlink()
-    monkeypatch.setattr("kcal.io.images.write_video", missing)
+    monkeypatch.setattr("kcal.io.images.write_video", Mock(side_effect=ImportError(name="av")))
     make(folder)
     said = capsys.readouterr()
     assert "wrote 1 files" in said.out

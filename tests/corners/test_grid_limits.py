@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -425,9 +426,7 @@ def test_quarter_turns_lean() -> None:
 def test_other_and_cut_boards_are_told_without_the_slow_detectors(
     monkeypatch: pytest.MonkeyPatch, columns: int, rows: int, cut: int
 ) -> None:
-    def refused(*_: object) -> None:
-        raise AssertionError("the image shows for certain that no whole 9x6 board is there")
-
+    refused = Mock(side_effect=AssertionError("the image shows for certain that no whole 9x6 board is there"))
     monkeypatch.setattr(search, "find_sector", refused)
     monkeypatch.setattr(search, "_find_shadowed", refused)
     y, x = np.mgrid[: 30 * rows + 110, : 30 * columns + 110]

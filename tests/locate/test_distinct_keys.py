@@ -6,6 +6,7 @@ import errno
 import random
 import tempfile
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from locate_rigs import real_rig
@@ -91,9 +92,7 @@ def test_nothing_is_written_of_a_refused_table(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_full_disk_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full() -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(tempfile, "TemporaryFile", full)
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(tempfile, "TemporaryFile", Mock(side_effect=full))
     with pytest.raises(FileError, match=r"marks.csv: .* No space left on device; set TMPDIR to a folder"):
         found([f"thing {i}" for i in range(17)], 4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -110,14 +111,10 @@ def test_corners_that_do_not_count_change_nothing() -> None:
 
 @pytest.mark.parametrize("method", ["lm", "adam"])
 def test_progress_may_end_it(method: str) -> None:
-    told: list[tuple[int, float]] = []
-
-    def progress(step: int, loss: float) -> bool:
-        told.append((step, loss))
-        return step == 2
-
+    progress = Mock(side_effect=lambda step, _: step == 2)
     options = JointOptions(method=method, hidden=(2, 2))  # type: ignore[arg-type]
     fit = train_jointly(*corners(), options, progress=progress)
+    told = [call.args for call in progress.call_args_list]
     assert [step for step, _ in told] == [1, 2]
     assert fit.inverse.status == SolverStatus.INTERRUPTED
     assert float(fit.losses[-1]) == pytest.approx(min(float(fit.losses[0]), *(loss for _, loss in told)))

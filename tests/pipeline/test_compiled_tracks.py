@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import pytest
 import torch
 from track_scenes import pairs_of, seen_by, tracked_site
@@ -47,13 +49,7 @@ def test_compiled_tracks_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_steps_that_cannot_be_compiled_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object, **__: object) -> object:
-        def call(*_: object) -> object:
-            raise RuntimeError("no compiler")
-
-        return call
-
-    monkeypatch.setattr(torch, "compile", fails)
+    monkeypatch.setattr(torch, "compile", Mock(return_value=Mock(side_effect=RuntimeError("no compiler"))))
     localize = tracked_site().weighing_all()
     nothing = no_beliefs(1, 0, 4, torch.device("cpu"))
     with pytest.raises(InputError, match="no compiler"):

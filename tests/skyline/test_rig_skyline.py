@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import functools
 import math
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
-from kcal import InputError, MeasuredPosition, Origin, RigData, solve_rig
+from kcal import InputError, MeasuredPosition, RigData, solve_rig
 from kcal.calibrate.rig.marks import SkylineSource
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.source import PosedCamera
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.locate import enu_from_cam
-from kcal.locate.ground import Raster
 from kcal.locate.stations import station_mounting
 from kcal.rig import SkylineImage, skyline_source
 from kcal.skyline import attitude
-from kcal.skyline.horizon import Horizon, terrain_horizon
+from kcal.skyline.horizon import terrain_horizon
 from scripts.shared.skyline_scenes import HillWeather
 from tests.helpers.skyline_site import ANGLES, ERROR, camera, image, small_site
 
@@ -94,17 +93,12 @@ def test_more_images_do_not_average_the_terrain() -> None:
 
 def test_images_of_one_camera_share_its_surroundings(monkeypatch: pytest.MonkeyPatch) -> None:
     """All around is looked for once; then once for each image, in its directions alone."""
-    seen_from: list[int] = []
-
-    def counted(raster: Raster, eye: Origin, azimuth: NDArray[np.float64], **given: float) -> Horizon:
-        seen_from.append(len(azimuth))
-        return terrain_horizon(raster, eye, azimuth, **given)
-
-    monkeypatch.setattr(attitude, "terrain_horizon", counted)
+    seen_from = Mock(wraps=terrain_horizon)
+    monkeypatch.setattr(attitude, "terrain_horizon", seen_from)
     site = small_site()
     images = [seen(moment, 0) for moment in (0, 1)]
     skyline_source(images, [camera()], site.raster, site.place, CENTERS[:1], SIGMA[:1], error=ERROR)
-    assert [count == 3600 for count in seen_from] == [True, False, False]
+    assert [len(call.args[2]) == 3600 for call in seen_from.call_args_list] == [True, False, False]
 
 
 def test_derivatives_of_the_term() -> None:

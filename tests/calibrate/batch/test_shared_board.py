@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -48,10 +49,6 @@ def solved(model: str) -> dict[str, CameraCalibrationResult]:
     return {name: calibrate_camera(SEEN[name], CalibrationOptions(model=model)) for name in NAMES}
 
 
-def name_of(seen: Observations) -> str:
-    return next(name for name in NAMES if SEEN[name].views[0].pixels == seen.views[0].pixels)
-
-
 @pytest.fixture
 def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[CameraJob]:
     """Three cameras of five images; the first two may share a board."""
@@ -64,7 +61,7 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[CameraJob]:
         return calibrated(solved("opencv4")[name], name)
 
     def again(seen: Observations, options: BatchOptions) -> Any:
-        return solved("opencv4")[name_of(seen)]
+        return next(solved("opencv4")[name] for name in NAMES if SEEN[name].views[0].pixels == seen.views[0].pixels)
 
     def sharing(alone: list[Any], options: CalibrationOptions, *, one_type: bool, run: Callable[..., Any]) -> list[Any]:
         assert (options.model, one_type) == ("hybrid", False)
@@ -80,8 +77,7 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[CameraJob]:
         (tmp_path / "images" / name).mkdir(parents=True)
         for i in range(5):
             (tmp_path / "images" / name / f"{i}.png").write_bytes(f"{name} {i}".encode())
-    found = read_jobs(tmp_path / "images", BOARD, "hybrid")
-    by_name = {job.name: job for job in found}
+    by_name = {job.name: job for job in read_jobs(tmp_path / "images", BOARD, "hybrid")}
     return [by_name["east"], by_name["west"], dataclasses.replace(by_name["lone"], model="opencv4")]
 
 
@@ -120,10 +116,7 @@ def test_cameras_that_share_a_board_are_calibrated_together(jobs: list[CameraJob
 def test_cameras_that_cannot_be_calibrated_together_stay_alone(
     jobs: list[CameraJob], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fails(*_: Any, **__: Any) -> Any:
-        raise DegenerateError("no common shape")
-
-    monkeypatch.setattr(module, "sharing", fails)
+    monkeypatch.setattr(module, "sharing", Mock(side_effect=DegenerateError("no common shape")))
     results, _, _ = together(jobs, tmp_path / "out")
     rows = results.rows()
     for row in rows[:2]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -242,19 +243,14 @@ def test_what_is_left_must_be_enough() -> None:
 
 
 def test_an_arithmetic_failure_is_an_error_of_the_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    def divided(*_: object) -> None:
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(hybrid, "calibrate_hybrid", divided)
+    monkeypatch.setattr(hybrid, "calibrate_hybrid", Mock(side_effect=ZeroDivisionError))
     with pytest.raises(InputError, match=r"no lens shows all corners where they are\. Look first at v0\d \("):
         calibrate_camera(observe(corners()[:6]))
 
 
 def test_views_are_named_where_the_fit_names_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise DegenerateError("the views do not determine the focal length")
-
-    monkeypatch.setattr(hybrid, "calibrate_hybrid", refuse)
+    failure = DegenerateError("the views do not determine the focal length")
+    monkeypatch.setattr(hybrid, "calibrate_hybrid", Mock(side_effect=failure))
     with pytest.raises(DegenerateError, match=r"focal length; the views are v00, v01, v02, v03, v04 and 7 more"):
         calibrate_camera(observe(corners()))
 

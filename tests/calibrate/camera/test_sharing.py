@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -187,9 +188,7 @@ def test_views_read_from_the_other_end_and_views_left_out() -> None:
 
 
 def test_one_type_is_refused_before_anything_is_calibrated(monkeypatch: pytest.MonkeyPatch) -> None:
-    def never(*_: object) -> None:
-        raise AssertionError("calibrated")
-
+    never = Mock(side_effect=AssertionError("calibrated"))
     monkeypatch.setattr("kcal.calibrate.camera.calibrate.calibrate_camera", never)
     with pytest.raises(InputError, match="hybrid lens only"):
         calibrate_cameras([seen_by(1)], CalibrationOptions(model="opencv5"), one_type=True)
@@ -206,10 +205,7 @@ def test_cameras_of_one_size_may_be_of_one_type() -> None:
 @pytest.mark.slow
 def test_cameras_that_saw_other_boards_are_not_fitted_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is common to them: each stays as it is alone, and no time is spent."""
-
-    def never(*_: object, **__: object) -> None:
-        raise AssertionError("fitted together")
-
+    never = Mock(side_effect=AssertionError("fitted together"))
     monkeypatch.setattr("kcal.calibrate.camera.calibrate.fit_cameras", never)
     found = [alone(1), alone(2)]
     other = Board(columns=BOARD.columns, rows=BOARD.rows, square=0.031)
@@ -221,9 +217,7 @@ def test_cameras_that_saw_other_boards_are_not_fitted_together(monkeypatch: pyte
 
 @pytest.mark.slow
 def test_cameras_that_cannot_be_fitted_together_stay_as_they_are_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object, **__: object) -> None:
-        raise DegenerateError("nothing fits")
-
+    fails = Mock(side_effect=DegenerateError("nothing fits"))
     monkeypatch.setattr("kcal.calibrate.camera.calibrate.fit_cameras", fails)
     found = result_of(calibrate_cameras([seen_by(1), seen_by(2)], STILL)[0])
     assert torch.equal(found.camera.params, alone(1).camera.params)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -348,13 +349,8 @@ class TestIntrinsics:
 
     def test_lenses_are_prepared_once_for_the_same_calibrations(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Whoever marks landmarks solves one rig again and again."""
-        prepared: list[int] = []
-
-        def counted(*arguments: object, **options: object) -> object:
-            prepared.append(1)
-            return joint_unknowns(*arguments, **options)  # type: ignore[arg-type]
-
-        monkeypatch.setattr(solve, "joint_unknowns", counted)
+        prepared = Mock(wraps=joint_unknowns)
+        monkeypatch.setattr(solve, "joint_unknowns", prepared)
         spread = torch.diag(torch.cat([torch.full((4,), 0.3), torch.zeros(6)]).double() ** 2)
         cameras = [camera.with_parameters(camera.params) for camera in CAMERAS[:2]]
         for camera in cameras:
@@ -362,14 +358,14 @@ class TestIntrinsics:
         sources = dataclasses.replace(data(landmarks=landmarks(count=20, noise=0.1)), cameras=tuple(cameras))
         first = solve_rig(sources)
         again = solve_rig(sources)
-        assert len(prepared) == 1
+        assert prepared.call_count == 1
         assert again.chi2 == first.chi2
         torch.testing.assert_close(again.joint_covariance(), first.joint_covariance(), rtol=0, atol=0)
         # Another calibration of the same camera is another rig.
         doubled = CameraInformation.from_covariance(cameras[0].params, 4.0 * spread)
         cameras[0].calibration = CameraCalibration(information=doubled)
         wider = solve_rig(sources)
-        assert len(prepared) == 2
+        assert prepared.call_count == 2
         assert float(wider.joint_covariance()[0, 0]) > 1.1 * float(first.joint_covariance()[0, 0])
 
     def test_marks_with_sigmas_of_their_own(self) -> None:
