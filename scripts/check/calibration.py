@@ -34,10 +34,6 @@ def real_sets(names: tuple[str, ...]) -> Iterator[tuple[str, Observations]]:
         yield name, seen
 
 
-def options(coefficients: int) -> CalibrationOptions:
-    return CalibrationOptions(model=LADDER[coefficients], weighted=False, weak_prior=None)
-
-
 @section("solver.md", "richer models", sets=("left",), most=8)
 def ladder(sets: tuple[str, ...] = SETS, most: int = 24) -> Iterator[str]:
     """RMS over the models, rises marked."""
@@ -47,7 +43,8 @@ def ladder(sets: tuple[str, ...] = SETS, most: int = 24) -> Iterator[str]:
         for name, seen in real_sets(sets):
             cells, rises, before = [], [], np.inf
             for coefficients in models:
-                result = calibrate_camera(seen, options(coefficients))
+                options = CalibrationOptions(model=LADDER[coefficients], weighted=False, weak_prior=None)
+                result = calibrate_camera(seen, options)
                 mark = {SolverStatus.AT_BOUND: "ᵇ", SolverStatus.FLAT: "ᶠ"}.get(result.status, "")
                 cells.append(f"{result.rms:.6f}{mark}")
                 if result.rms > before * (1 + SAME_RMS):

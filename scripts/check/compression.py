@@ -6,11 +6,9 @@ all frames, which the tracker must know (`TrackOptions.lasting_px`): it shows in
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 import tempfile
-from collections.abc import Iterator
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -62,10 +60,6 @@ def write(path: str, images: list[Tensor], crf: int) -> None:
         container.mux(stream.encode())
 
 
-def next_of(turns: Iterator[Floats], _: object) -> Floats:
-    return next(turns)
-
-
 class Errors(NamedTuple):
     """Of matched disparities (frames, plates), and the variances stated for them; NaN where a plate was not matched."""
 
@@ -82,10 +76,7 @@ def errors_of(rig: Rig, films: list[list[Tensor]], boxes: list[list[Floats]], pa
             write(video, film, crf)
         # The detector is asked for the left and the right image in turn, and knows the answers.
         turns = itertools.chain.from_iterable(zip(*boxes, strict=True))
-        source = Videos(
-            videos, rig, functools.partial(next_of, turns), AssociationOptions(),
-            late=lambda _: 0.0, match_sigma=0.0,
-        )  # fmt: skip
+        source = Videos(videos, rig, lambda _: next(turns), AssociationOptions(), late=lambda _: 0.0, match_sigma=0.0)
         for frame, item in enumerate(source(0)):
             assert not isinstance(item.moment, Exception)
             pairs = item.moment.pairs

@@ -11,7 +11,7 @@ import json
 import math
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,7 @@ LENSES = {
     "opencv14": [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, 0.02, 0.003, 1e-3, -1e-3, 2e-3, 1e-3, 0.01, 0.02],
     "fisheye4": [0.05, -0.01, 0.003, -0.001],
 }
+FISHEYE, BROWN = ("k1", "k2", "k3", "k4"), ("k1", "k2", "p1", "p2", "k3")
 Project = Callable[[Path, np.ndarray], np.ndarray]
 
 
@@ -102,6 +103,12 @@ def opencv_formula(points: np.ndarray, matrix: np.ndarray, lens: np.ndarray, fis
     return np.asarray(cv2.projectPoints(points, zero, zero, matrix, lens)[0][:, 0])
 
 
+def by_vector(values: Sequence[float] | np.ndarray, points: np.ndarray, fisheye: bool = False) -> np.ndarray:
+    """By fx, fy, cx, cy and OpenCV's coefficients, or none."""
+    fx, fy, cx, cy, *lens = values
+    return opencv_formula(points, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(lens or [0.0] * 4), fisheye)
+
+
 def by_opencv(path: Path, points: np.ndarray) -> np.ndarray:
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     fisheye = bool(file.getNode("fisheye_model").real())
@@ -115,18 +122,15 @@ def by_kalibr(path: Path, points: np.ndarray) -> np.ndarray:
     kind = "omni-radtan" if camera["camera_model"] == "omni" else camera["camera_model"]
     if kind != "pinhole":
         return by_formula("kalibr", kind, path, points)
-    fu, fv, pu, pv = camera["intrinsics"]
-    matrix = np.array([[fu, 0, pu], [0, fv, pv], [0, 0, 1]])
-    fisheye = camera["distortion_model"] == "equidistant"
-    return opencv_formula(points, matrix, np.array(camera["distortion_coeffs"]), fisheye)
+    values = [*camera["intrinsics"], *camera["distortion_coeffs"]]
+    return by_vector(values, points, camera["distortion_model"] == "equidistant")
 
 
 def by_nerfstudio(path: Path, points: np.ndarray) -> np.ndarray:
     c = json.loads(path.read_text())
-    matrix = np.array([[c["fl_x"], 0, c["cx"]], [0, c["fl_y"], c["cy"]], [0, 0, 1]])
     fisheye = c["camera_model"] == "OPENCV_FISHEYE"
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-    return opencv_formula(points, matrix, np.array([c.get(name, 0.0) for name in names]), fisheye) - 0.5
+    names = "fl_x", "fl_y", "cx", "cy", *(FISHEYE if fisheye else BROWN)
+    return by_vector([c.get(name, 0.0) for name in names], points, fisheye) - 0.5
 
 
 def by_matlab(path: Path, points: np.ndarray) -> np.ndarray:
@@ -140,10 +144,9 @@ def by_matlab(path: Path, points: np.ndarray) -> np.ndarray:
 
 def by_opensfm(path: Path, points: np.ndarray) -> np.ndarray:
     c = next(iter(json.loads(path.read_text()).values()))
-    matrix = np.array([[c["focal_x"], 0, c["c_x"]], [0, c["focal_y"], c["c_y"]], [0, 0, 1]])
     fisheye = c["projection_type"] == "fisheye_opencv"
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-    seen = opencv_formula(points, matrix, np.array([c[name] for name in names]), fisheye)
+    names = "focal_x", "focal_y", "c_x", "c_y", *(FISHEYE if fisheye else BROWN)
+    seen = by_vector([c[name] for name in names], points, fisheye)
     return seen * max(c["width"], c["height"]) + (np.array([c["width"], c["height"]]) - 1) / 2
 
 
@@ -151,11 +154,8 @@ def by_basalt(path: Path, points: np.ndarray) -> np.ndarray:
     (lens,) = json.loads(path.read_text())["value0"]["intrinsics"]
     if lens["camera_type"] in ("ds", "eucm"):
         return by_formula("basalt", lens["camera_type"], path, points)
-    fx, fy, cx, cy, *terms = lens["intrinsics"].values()
-    fisheye = lens["camera_type"] == "kb4"
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     # What follows the eight of pinhole-radtan8 is the radius of its domain.
-    return opencv_formula(points, matrix, np.array(terms[:8]) if terms else np.zeros(4), fisheye)
+    return by_vector([*lens["intrinsics"].values()][:12], points, lens["camera_type"] == "kb4")
 
 
 def by_multical(path: Path, points: np.ndarray) -> np.ndarray:
@@ -330,13 +330,7 @@ def by_numpy(path: Path, points: np.ndarray) -> np.ndarray:
 
 
 def by_ceres(path: Path, points: np.ndarray) -> np.ndarray:
-    return by_vector(np.array(json.loads(path.read_text())["cameras"][0]["mean"]), points)
-
-
-def by_vector(values: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """By fx, fy, cx, cy and OpenCV's coefficients."""
-    matrix = np.array([[values[0], 0, values[2]], [0, values[1], values[3]], [0, 0, 1]])
-    return opencv_formula(points, matrix, values[4:], False)
+    return by_vector(json.loads(path.read_text())["cameras"][0]["mean"], points)
 
 
 def by_rosbags(path: Path, points: np.ndarray) -> np.ndarray:
@@ -500,11 +494,9 @@ def _half_less(pixels: Any) -> np.ndarray:
 
 def agisoft(folder: Path) -> tuple[Path, np.ndarray, str, Callable[[np.ndarray], np.ndarray]]:
     """A sensor with Metashape's parameters and their covariance, and the manual's formula."""
-    path, f, cx, cy = folder / "a.xml", 1000.0, 3.0, -2.0
-    k1, k2, k3, k4, p1, p2 = -0.2, 0.05, 0.01, -0.002, 1e-3, -2e-3
-    terms = dict(
-        zip(("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2"), (f, cx, cy, k1, k2, k3, k4, p1, p2), strict=True)
-    )
+    path = folder / "a.xml"
+    terms = dict(f=1000.0, cx=3.0, cy=-2.0, k1=-0.2, k2=0.05, k3=0.01, k4=-0.002, p1=1e-3, p2=-2e-3)
+    f, cx, cy, k1, k2, k3, k4, p1, p2 = terms.values()
     sigma = dict(zip(terms, (0.5, 0.7, 0.8, 1e-3, 2e-3, 3e-3, 4e-3, 1e-4, 2e-4), strict=True))
     spread = " ".join(map(str, np.diag(np.array(list(sigma.values())) ** 2).ravel()))
     path.write_text(

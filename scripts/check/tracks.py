@@ -93,7 +93,10 @@ class Pixels(MeasurementModel):
     """Four pixel coordinates of a target, of which the right two are seen `delay` seconds later; pinholes only."""
 
     ndim_state: int = 6
+    ndim_meas: int = 4
     mapping: Any = (0, 2, 4)
+    rvs: Any = None  # not needed
+    pdf: Any = None
     cameras: Any = Property(doc="Matrix, rotation from east, north and up, and shift of both cameras.")
     delay: float = Property(doc="Seconds.")
     covariance: Any = Property(doc="Of the pixels.")
@@ -110,11 +113,6 @@ class Pixels(MeasurementModel):
             )
         ]
         return cls(cameras=cameras, delay=delay, covariance=covariance.numpy())
-
-    @property
-    def ndim_meas(self) -> int:
-        """Four."""
-        return 4
 
     def covar(self, **_: Any) -> Any:
         """Of the pixels."""
@@ -145,14 +143,6 @@ class Pixels(MeasurementModel):
             information = slope.T @ weight @ slope + prior
             state = state + np.linalg.solve(information, slope.T @ weight @ (seen - values[:, 12]) - prior @ state)
         return state, np.linalg.inv(information)
-
-    def rvs(self, *_: Any, **__: Any) -> Any:
-        """Not needed."""
-        raise NotImplementedError
-
-    def pdf(self, *_: Any, **__: Any) -> Any:
-        """Not needed."""
-        raise NotImplementedError
 
 
 class OfPixels(CartesianFilters):

@@ -28,9 +28,8 @@ POWER, START = 0.5**2, datetime.datetime(2026, 1, 1)
 class StraightLine(TransitionModel):
     """Cartesian straight motion, in the coordinates of the filter; derivatives are Stone Soup's own differences."""
 
-    @property
-    def ndim_state(self) -> int:
-        return 6
+    ndim_state = 6
+    rvs = pdf = None  # not needed
 
     def function(self, state, noise=False, time_interval=None, **_):
         x, y, inverse, *pace = np.asarray(state.state_vector, float).ravel()
@@ -65,12 +64,6 @@ class StraightLine(TransitionModel):
         slope[3:, 3:] = np.eye(3) / place[2]
         slope[3:, 2] = -velocity / place[2] ** 2
         return slope @ cartesian @ slope.T
-
-    def rvs(self, *_, **__):
-        raise NotImplementedError
-
-    def pdf(self, *_, **__):
-        raise NotImplementedError
 
 
 def test_filter_and_smoother_are_those_of_stone_soup() -> None:
