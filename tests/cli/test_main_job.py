@@ -90,7 +90,7 @@ class TestRealImages:
         _, error = run("locate r.json points.csv --site -33.9,151.2,10 --heading 250", outputs)
         # What its solution warned of travels with the rig.
         *told, noise = error.splitlines()
-        assert all(line.startswith(("warning: r.json: board left", " ")) for line in told), error
+        assert all(line.startswith(("warning: r.json: the boards differ", " ")) for line in told), error
         assert noise == "noise of marks: 0.3 px, assumed; --pixel-sigma states it"
         ends = [[float(row[f"{axis}_m"]) for axis in ("east", "north", "up")] for row in rows_of("p.csv")]
         assert math.isclose(math.dist(*ends), 0.025 * math.hypot(8, 5), rel_tol=5e-3)

@@ -168,7 +168,9 @@ def _amplitudes(white: Tensor, rig: RigRows, camera: int) -> tuple[ViewData, Pri
     data, families = rig.told(camera, white)
     begin = np.full(white.shape[1] // AXES, math.log(MEDIAN) - 0.5 * math.log(rig.variance))
     best = maximize_evidence(data, families, Amplitudes(_NONE, rig.variance, begin), _NO_PRIOR)
-    return data, families, best, loss_at(data, best, families, 1.0)
+    # What motions do not feel has its part in the evidence, too: other motions feel other combinations.
+    unfelt = 0.5 * (rig.shared_size - len(data.still.at)) * math.log1p(_WIDE**2 / best.variance)
+    return data, families, best, loss_at(data, best, families, 1.0) + unfelt
 
 
 class RigRows:
@@ -184,7 +186,7 @@ class RigRows:
     def __init__(self, parts: Iterable[CameraRows], good: Tensor, shared_size: int) -> None:
         self.parts = {part.camera: part for part in parts}
         finite = [part.rows.isfinite().all(-1).all(-1) for part in self.parts.values()]
-        self.good, self._size = torch.stack([good, *finite]).all(0), shared_size
+        self.good, self.shared_size = torch.stack([good, *finite]).all(0), shared_size
         self._whole: _Whole | None = None
 
     def put(self, camera: int, rows: Tensor) -> None:
@@ -196,7 +198,7 @@ class RigRows:
         """These rows, with one board no longer among the good ones."""
         good = self.good.clone()
         good[board] = False
-        return RigRows(self.parts.values(), good, self._size)
+        return RigRows(self.parts.values(), good, self.shared_size)
 
     @property
     def variance(self) -> float:
@@ -209,7 +211,7 @@ class RigRows:
             some = [part._replace(rows=part.rows[self.good]) for part in self.parts.values()]
             residuals = sum(int((part.rows[:, :_POSE] != 0).any(1).sum()) for part in some)
             count = residuals - _POSE * int(self.good.sum())
-            self._whole = _Whole.of(summed_products(some, _POSE, self._size), count)
+            self._whole = _Whole.of(summed_products(some, _POSE, self.shared_size), count)
         return self._whole
 
     def told(self, camera: int, white: Tensor) -> tuple[ViewData, PriorFamilies]:
@@ -237,7 +239,8 @@ class RigRows:
         basis = basis[:, explained > _UNFELT]
         felt, pull = basis.T @ felt, basis.T @ whole.pull
         square = whole.square - float(whole.pull.square().sum() - pull.square().sum())
-        freedom = whole.freedom - (whole.determined - len(pull) + float((basis.T @ whole.loose).square().sum()))
+        many = len(alone) < len(basis)
+        freedom = whole.freedom - ((whole.determined if many else len(basis)) - len(pull))
         size = len(pull)
         products = torch.eye(size + 1, dtype=pull.dtype)
         products[-1, :-1] = products[:-1, -1] = pull
@@ -259,7 +262,6 @@ class _Whole(NamedTuple):
         root: (S, S) lower triangle of its products in this scale, what is hardly known included.
         pull: (S,) products with the residuals, in combinations of unit weight.
         determined: how many of these combinations the boards determine.
-        loose: (S, S) root of the share of these combinations that nothing determines.
         freedom: residuals, less those that poses take up.
         square: of all residuals.
         variance: mean of that.
@@ -271,7 +273,6 @@ class _Whole(NamedTuple):
     root: Tensor
     pull: Tensor
     determined: float
-    loose: Tensor
     freedom: int
     square: float
     variance: float
@@ -293,10 +294,9 @@ class _Whole(NamedTuple):
         matrix.diagonal().add_(torch.where(length > 0, weak, 1.0))
         root = torch.linalg.cholesky(matrix)
         pull = torch.linalg.solve_triangular(root, (total[:-1, -1] * unit)[:, None], upper=False)[:, 0]
-        there = torch.diag((length > 0).to(root.dtype))
-        loose = math.sqrt(weak) * torch.linalg.solve_triangular(root, there, upper=False)
-        determined = float(there.sum() - loose.square().sum())
-        return cls(pose, half, unit, root, pull, determined, loose, count, square, variance)
+        inverse = torch.linalg.solve_triangular(root, torch.diag((length > 0).to(root.dtype)), upper=False)
+        determined = int((length > 0).sum()) - weak * float(inverse.square().sum())
+        return cls(pose, half, unit, root, pull, determined, count, square, variance)
 
 
 class WithoutMotion:
