@@ -60,7 +60,7 @@ def test_a_drift_is_found_told_and_drawn(site: Path, command: Command) -> None:
     assert float(rows[2]["relative_yaw_sigma_deg"]) > 0.015
     # Nothing new: nothing is looked at, no new alarm.
     again = command("watch", *words, "-o", history, "--relock", site / "new.json")
-    assert "not re-locked: a day of history is needed" in " ".join(again.out.split())
+    assert "not re-locked: a day of history and more than 20 measurements are needed" in " ".join(again.out.split())
     assert not (site / "new.json").exists()
 
 
