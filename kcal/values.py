@@ -208,7 +208,7 @@ def _number_or_nan(text: str) -> float:
 
 
 def split_address(text: str) -> SplitResult:
-    """The parts of SCHEME://HOST:PORT/PATH; all empty where brackets or the port are none.
+    """The parts of SCHEME://HOST:PORT/PATH; all of them empty if the port or the host in brackets cannot be.
 
     Example:
         >>> split_address("udp://127.0.0.1:18999").port, split_address("udp://[::1:5").hostname
@@ -216,7 +216,7 @@ def split_address(text: str) -> SplitResult:
     """
     try:
         parts = urlsplit(text)
-        # Asked for, a port beyond 65535 is an error.
+        # Reading a port that is no number or beyond 65535 raises ValueError.
         return parts if parts.port != 0 else urlsplit("")
     except ValueError:
         return urlsplit("")

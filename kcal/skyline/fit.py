@@ -151,6 +151,21 @@ def _minima(cost: Floats, azimuth: Floats) -> list[int]:
     return found
 
 
+def _robust_rotation(
+    columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, errors: SkylineErrors, used: Bools | None
+) -> Floats:
+    """A rotation after some steps: columns count by what they tell alone, and less the worse they fit."""
+
+    def weight(seen: Comparison) -> Floats:
+        sigma = column_sigma(seen, errors)
+        ratio = seen.residual / sigma
+        limit = np.where(ratio > 0, _ABOVE, _FAR_BELOW)
+        soft = 1.0 / (1.0 + np.square(ratio / limit)) if used is None else used.astype(np.float64)
+        return seen.known * soft / np.square(sigma)
+
+    return _reweighted(columns, horizon, rotation, camera, weight, _STEPS, math.radians(1.0))
+
+
 def _reweighted(
     columns: Columns, horizon: Horizon, rotation: Floats, camera: Camera, weight: Callable[[Comparison], Floats],
     steps: int, longest: float,
@@ -276,17 +291,8 @@ def fit_rotation(
         None if fewer than eight columns agree.
     """
     used = np.ones(len(columns.pixel), dtype=np.bool_)
-
-    def weight(seen: Comparison) -> Floats:
-        """Columns count by what they tell alone; in the first round, less the worse they fit."""
-        sigma = column_sigma(seen, errors)
-        ratio = seen.residual / sigma
-        limit = np.where(ratio > 0, _ABOVE, _FAR_BELOW)
-        soft = used.astype(np.float64) if number else 1.0 / (1.0 + np.square(ratio / limit))
-        return seen.known * soft / np.square(sigma)
-
     for number in range(_ROUNDS):
-        rotation = _reweighted(columns, horizon, rotation, camera, weight, _STEPS, math.radians(1.0))
+        rotation = _robust_rotation(columns, horizon, rotation, camera, errors, used if number else None)
         before, used = used, _columns_that_agree(compare(columns, horizon, rotation, camera), errors, _FAR_BELOW)
         if used.sum() < _LEAST:
             return None

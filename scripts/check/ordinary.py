@@ -220,10 +220,10 @@ def _rig(sides: list[Observations], pairs: list[int]) -> RigResult:
 def _drawn_pairs(name: str, count: int, seed: int) -> Record:
     """The rig of so many pairs, drawn at random, against that of the others."""
     sides = [load(side).seen for side in PAIRS[name]]
-    all_of_them = list(range(len(sides[0].views)))
-    drawn = sorted(random.Random(f"{name} {count} {seed}").sample(all_of_them, count))
+    numbers = range(len(sides[0].views))
+    drawn = sorted(random.Random(f"{name} {count} {seed}").sample(numbers, count))
     found = []
-    for which, pairs in (("part", drawn), ("rest", [i for i in all_of_them if i not in drawn])):
+    for which, pairs in (("part", drawn), ("rest", [i for i in numbers if i not in drawn])):
         try:
             found.append(_rig(sides, pairs))
         except KcalError as refusal:
@@ -269,10 +269,7 @@ def pairs(
     for name, count in dict.fromkeys(tuple(key[:2]) for key in keys):
         ours = [record for record in records if tuple(record["key"][:2]) == (name, count)]
         known = [record for record in ours if "chi2" in record]
-        z = [f"{statistics.fmean(r[f'z {away:g}'] ** 2 for r in known) ** 0.5:.2f}" for away in AWAY]
-        yield [
-            name,
-            *map(str, [count, len(ours), len(ours) - len(known)]),
-            f"{statistics.fmean(r['chi2'] for r in known):.2f}",
-            *z,
-        ]
+        chi2 = [record["chi2"] for record in known]
+        squares = [[record[f"z {away:g}"] ** 2 for record in known] for away in AWAY]
+        means = [statistics.fmean(chi2), *(math.sqrt(statistics.fmean(one)) for one in squares)] if known else []
+        yield [name, *map(str, [count, len(ours), len(ours) - len(known)]), *(f"{mean:.2f}" for mean in means)]

@@ -524,7 +524,7 @@ def rig_result(
     against_them = [name for i, name in enumerate(work.labels) if not mask[i] and i not in reasons]
     if only_boards and refuse and against_them and len(data.cameras) == 2 and count < _ENOUGH_BOARDS:
         raise InputError(
-            f"{' and '.join(against_them[:3])} and the other {count} contradict each other, and of so few nobody can "
+            f"{' and '.join(against_them)} and the other {count} contradict each other, and of so few nobody can "
             f"tell which is wrong: photograph the board more often, so that {_ENOUGH_BOARDS} or more agree"
         )
     focal = [float(camera.params[0]) for camera in data.cameras]

@@ -239,6 +239,7 @@ class RigRows:
         basis = basis[:, explained > _UNFELT]
         felt, pull = basis.T @ felt, basis.T @ whole.pull
         square = whole.square - float(whole.pull.square().sum() - pull.square().sum())
+        # Of more unknowns than motions, some are determined by nothing.
         many = len(alone) < len(basis)
         freedom = whole.freedom - ((whole.determined if many else len(basis)) - len(pull))
         size = len(pull)

@@ -81,9 +81,9 @@ def test_views_in_both_count_once() -> None:
 def test_further_views_help() -> None:
     """Eight of the calibration's fourteen views in the rig: better than these alone, no better than all of them."""
     some, alone, everything = rig("hybrid", 14, 8), rig("hybrid", 8, 8), rig("hybrid", 14, 14)
-    # Of the second parameter of the lens, which views near the border tell.
-    bend = [float(found.joint_covariance()[6, 6].sqrt()) for found in (alone, some, everything)]
-    assert bend[0] > 1.3 * bend[1]
+    # Of a coefficient of the lens, which views near the border tell.
+    bend = [float(found.joint_covariance()[9, 9].sqrt()) for found in (alone, some, everything)]
+    assert bend[0] > 1.5 * bend[1]
     assert bend[2] < bend[1] < 1.2 * bend[2]
 
 
@@ -103,7 +103,7 @@ def test_hybrid_cameras_are_refined_with_their_board() -> None:
 
 
 def test_single_corners_are_off_by_what_both_cameras_found() -> None:
-    """Found: the second camera had those of the first, which a few views tell to no more than half of what they are."""
+    """Found: the second camera had those of the first, which a few views do not tell well."""
     both = [copy.deepcopy(camera) for camera in cameras("hybrid", tuple(f"{i}.png" for i in range(14)))]
     parts = gathered(both, [known(camera) for camera in both], BOARD)[0]
     before = joint_unknowns(both, parts, BOARD)[1]
