@@ -129,7 +129,10 @@ class TestRig:
         assert result.flipped == ()
         assert result.left_out == ()
         # One of these pairs costs ten times as much to join as the typical one: nothing is left out, but it is named.
-        assert [text.split(": it does not fit")[0] for text in result.warnings] == ["board left08.jpg right08.jpg"]
+        named, scatter = result.warnings
+        assert named.startswith("board left08.jpg right08.jpg: it does not fit")
+        # Fixed cameras of five coefficients pull the boards apart by more than their corners' noise explains.
+        assert scatter.startswith("the boards differ from each other by")
         board = BOARD.points.float().numpy()
         corners = [list(seen[side].pixels().float().numpy()) for side in SIDES]
         lenses = [
