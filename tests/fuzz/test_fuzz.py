@@ -30,7 +30,7 @@ from scripts.fuzz.readers import missing
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="cases run in child processes")
 
 # Of each harness: a second of computing.
-CASES, FEWER = 100, {"commands": 12, "mrcal .cameramodel": 40}
+CASES, FEWER = 100, {"commands": 12, "mrcal .cameramodel": 40, "omni": 30}
 CORPUS = Path(__file__).parent / "corpus"
 
 

@@ -579,20 +579,25 @@ _TAILS = 3.0
 _REPEATS = 30
 
 
-def relative_bends(data: ViewData, best: Amplitudes, families: PriorFamilies) -> Tensor:
-    """(V,) the factors w of each view, at the best lens and board."""
+def relative_bends(data: ViewData, best: Amplitudes, families: PriorFamilies) -> tuple[Tensor, Amplitudes]:
+    """(V,) the factors w of each view, at the best lens and board; and the amplitudes, with s that belongs to them."""
     assert data.relative is not None
     step = _best(data.integrated(best.log_ratio).data, families, best.h.numpy(), math.log(best.variance)).step
     left = data.cross @ torch.cat([torch.from_numpy(step), torch.ones(1).double()])
-    relative, square = data.relative, best.variance * math.exp(2.0 * best.log_ratio[-1])
+    relative, ratio, (usual, sd) = data.relative, best.log_ratio.copy(), usual_motion(len(best.log_ratio), False)
     for _ in range(_REPEATS):
-        inverse = torch.linalg.inv(data.own + torch.diag_embed(stillness(best.log_ratio, relative)))
+        inverse = torch.linalg.inv(data.own + torch.diag_embed(stillness(ratio, relative)))
         mean, spread = inverse @ left[..., None], inverse.diagonal(dim1=1, dim2=2)
-        moment = (mean[..., 0].square() + best.variance * spread)[:, -BENDS:].sum(1) / square
-        before, relative = relative, ((_TAILS + moment) / (_TAILS + BENDS)).sqrt()
+        moment = (mean[..., 0].square() / best.variance + spread)[:, -BENDS:].sum(1) * math.exp(-2.0 * ratio[-1])
+        before, found = relative, ((_TAILS + moment) / (_TAILS + BENDS)).sqrt()
+        # Views tell s w. Both at the best share: s and w in turn, each at its own best, would creep there (C. Liu,
+        # D. B. Rubin, Y. N. Wu 1998: parameter expansion to accelerate EM).
+        pull = (ratio[-1] + 0.5 * math.log(best.variance) - usual[-1]) / sd[-1] ** 2
+        size = math.sqrt((len(found) - pull / _TAILS) / float(found.square().reciprocal().sum()))
+        relative, ratio[-1] = found / size, ratio[-1] + math.log(size)
         if torch.allclose(relative, before, rtol=1e-5, atol=0.0):
             break
-    return relative
+    return relative, best._replace(log_ratio=ratio)
 
 
 # How large amplitudes are on the average, where views tell them only roughly.

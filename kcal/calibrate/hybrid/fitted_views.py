@@ -496,7 +496,7 @@ def run_rounds(
             if not resting:
                 break
         if data.relative is not None:
-            relative = relative_bends(data, best, estimate.families)
+            relative, best = relative_bends(data, best, estimate.families)
             moved = float((relative / data.relative).log().abs().max())
             resting &= moved < (_NEAR_REST if rough else _AT_REST)
             data = data._replace(relative=relative)

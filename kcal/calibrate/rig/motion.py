@@ -235,8 +235,11 @@ class RigRows:
         own = moving @ moving.mT - by_pose @ by_pose.mT
         alone = own.diagonal(dim1=-2, dim2=-1).flatten()
         share = felt * torch.where(alone > 0, alone.rsqrt(), 0.0)
-        explained, basis = torch.linalg.eigh(share @ share.T)
+        few = len(share) <= share.shape[1]
+        explained, basis = torch.linalg.eigh(share @ share.T if few else share.T @ share)
         basis = basis[:, explained > _UNFELT]
+        if not few:
+            basis = torch.linalg.qr(share @ basis)[0]
         felt, pull = basis.T @ felt, basis.T @ whole.pull
         square = whole.square - float(whole.pull.square().sum() - pull.square().sum())
         # Of more unknowns than motions, some are determined by nothing.

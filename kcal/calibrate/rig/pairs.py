@@ -348,30 +348,28 @@ def consensus(
     Each of some pairs, evenly taken, proposes a relative pose, with the corners as read and with the second camera's
     order turned by 180°.
     """
-    some = evenly(len(pixels), _PROPOSALS).tolist()
-    proposals = [right.some(i).after(left.some(i).inverse()) for i in some]
-    proposals += [right.some(i).after(half_turn(board)).after(left.some(i).inverse()) for i in some]
-    as_read, other_end = pixels[:, 1], pixels[:, 1].flip(-2)
+    some = evenly(len(pixels), _PROPOSALS)
+    ahead, back = right.some(some), left.some(some).inverse()
+    proposals = Pose(*map(torch.cat, zip(ahead.after(back), ahead.after(half_turn(board)).after(back), strict=True)))
     points_left = board @ left.rotation.transpose(-1, -2) + left.translation[:, None]
-    best: tuple[float, Pose, Tensor, Tensor] | None = None
-    for number, proposal in enumerate(proposals):
-        projected, valid = cameras[1].project(points_left @ proposal.rotation.T + proposal.translation)
-        projected = torch.where(valid[..., None], projected, torch.inf)
-        errors = torch.stack([_distance(projected, as_read), _distance(projected, other_end)])
-        turned = errors[1] < _TURNED * errors[0]
-        error = torch.where(turned, errors[1], errors[0])
-        # At least two pairs must agree, or every proposal would be right about its own pair.
-        rank = min(len(error), max(2, (len(error) + 1) // 2))
-        score = float(error.sort().values[rank - 1])
+    points_right = points_left @ proposals.rotation.mT[:, None] + proposals.translation[:, None, None]
+    projected, valid = cameras[1].project(points_right)
+    projected = torch.where(valid[..., None], projected, torch.inf)
+    as_read, other_end = (_distance(projected, seen) for seen in (pixels[:, 1], pixels[:, 1].flip(-2)))
+    turned = other_end < _TURNED * as_read
+    error = torch.where(turned, other_end, as_read)
+    # At least two pairs must agree, or every proposal would be right about its own pair.
+    rank = min(len(pixels), max(2, (len(pixels) + 1) // 2))
+    scores, best = error.sort(-1).values[:, rank - 1].tolist(), 0
+    for number, score in enumerate(scores):
         # One pair, or boards that hardly moved, fit a turned proposal as well: then the order is as read.
-        if best is None or score < (_TURNED if number >= len(some) else 1.0) * best[0]:
-            best = (score, proposal, turned, error)
-    assert best is not None
-    return best[1:]
+        if score < (_TURNED if number >= len(some) else 1.0) * scores[best]:
+            best = number
+    return proposals.some(best), turned[best], error[best]
 
 
 def _distance(projected: Tensor, observed: Tensor) -> Tensor:
-    """Root mean square distance (P,) over the corners that were seen."""
+    """Root mean square distance (..., P) over the corners that were seen."""
     return torch.sqrt(torch.nanmean(((projected - observed) ** 2).sum(-1), -1))
 
 
