@@ -38,9 +38,9 @@ _ROLES: dict[str, tuple[str, Sequence[int]]] = {
     "sigmas": ("std(?:ard)?dev(?:iation)?s?(?:intrinsics)?", range(4, 19)),
     "rotation": ("(?:stereo)?(?:r|rot(?:ation)?(?:matrix|mat|vector|vec)?|rmat)", (3, 9)),
     "translation": ("(?:stereo)?(?:t|trans(?:lation)?(?:vector|vec)?|tvec)", (3,)),
-    # ORB-SLAM3's first camera from the second; the body from a camera in files of OKVIS and maplab.
+    # ORB-SLAM3's first camera from the second, and OKVIS's body from a camera.
     "second": ("(?:stereo)?tc1c2|tlr", (12, 16)),
-    "body": ("t(?:sc|bc)", (16,)),
+    "body": ("tsc", (16,)),
     "binning_x": ("binningx?", (1,)),
     "binning_y": ("binningy", (1,)),
     "roi": ("roi|regionofinterest", (-1,)),
@@ -208,11 +208,11 @@ def read_keyed(content: Mapping[str, Any], name: str, hints: foreign.Hints, titl
     notes: list[str] = []
     inside, outer = _cameras_inside(content)
     if inside:
-        named, shared = _Named(_flattened(outer)), _said(outer)
+        named, shared = _Named(_flattened(outer)), _for_all(outer)
         named.keys.read.update(shared)
         parts = {
             str(part.get("name") or part.get("camera_name") or (key if len(inside) > 1 else name)): (
-                _Named(_together(shared, part)), "",
+                _Named(_with_shared(shared, part)), "",
             )
             for key, part in inside.items()
         }  # fmt: skip
@@ -249,16 +249,16 @@ def read_keyed(content: Mapping[str, Any], name: str, hints: foreign.Hints, titl
 _SIZES, _KINDS = ("width", "height", "size"), ("kind", "fisheye")
 
 
-def _said(content: Mapping[str, Any], roles: Sequence[str] = (*_SIZES, *_KINDS)) -> dict[str, Any]:
+def _for_all(content: Mapping[str, Any], roles: Sequence[str] = (*_SIZES, *_KINDS)) -> dict[str, Any]:
     """What a mapping says of all cameras inside it."""
     found = {key: _role(key, value) for key, value in content.items()}
     return {key: content[key] for key, role in found.items() if role is not None and role[0] in roles}
 
 
-def _together(shared: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
+def _with_shared(shared: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
     """The values of a camera, with those of all cameras; a size of its own is in place of theirs."""
     own = _flattened(part)
-    left = _said(shared, _KINDS if _said(own, _SIZES) else (*_SIZES, *_KINDS))
+    left = _for_all(shared, _KINDS if _for_all(own, _SIZES) else (*_SIZES, *_KINDS))
     return left | own
 
 
@@ -281,8 +281,8 @@ def _cameras_inside(content: Mapping[str, Any]) -> tuple[dict[str, Mapping[str, 
             found[str(key)] = part
             outer.pop(key, None)
         elif deeper:
-            shared = _said(rest)
-            found |= {f"{key} {name}": _together(shared, one) for name, one in deeper.items()}
+            shared = _for_all(rest)
+            found |= {f"{key} {name}": _with_shared(shared, one) for name, one in deeper.items()}
             outer[key] = {name: value for name, value in rest.items() if name not in shared}
     return found, outer
 
