@@ -352,7 +352,6 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
     ),
     "vikit's ATAN": ("a.json", VIKIT | {"model": "ATAN"}, "model ATAN: kcal reads"),
     "DSO": ("camera.txt", "0.53 0.67 0.49 0.51 0.9\n640 480\ncrop\n640 480\n", "a file of DSO"),
-    "DSO with a name": ("camera.txt", "RadTan 500 505 330 236 -0.2 0.1 0 0\n640 480\nfull\n640 480\n", "a file of DSO"),
     "Middlebury": ("calib.txt", "cam0=[500 0 330; 0 500 236; 0 0 1]\ndoffs=12\n", "a file of Middlebury"),
     "Gyroflow": ("a.json", {"calib_dimension": {"w": 640}, "fisheye_params": {"camera_matrix": M}}, "of Gyroflow"),
     "misspelled": ("a.yml", opencv("K", "distrotion_coeffs"), "distrotion_coeffs .5 numbers. may describe the lens"),
