@@ -260,16 +260,16 @@ def whole_size(width: Any, height: Any) -> tuple[int, int]:
 
 # Keys of files. Names are compared without case and punctuation.
 
-BEFORE = re.compile(r"(left|right|(?:cam(?:era)?)?[0-9])(.+)")
+BEFORE = re.compile(r"(left|right|(?:cam(?:era)?)?[0-9]{1,3})(.+)")
 # Keys of other things than a lens, and keys of a lens.
 OTHER = re.compile(
     "err|rms|resid|uncert|^std|std$|sigma|view|object|(?<!principal)point|corner|board|square|pattern|marker|target|grid|time"
     "|date$|stamp|flag|extrin|pose|rotat|translat|rvec|tvec|quat|orient|posit|world|valid|^new|optimal|undist|rectif|^proj"
-    "|essential|fundamental|fps|rate|name|path|file|version|count|^num|comment|note|desc|serial|id$|header|frame|gain"
+    "|essential|fundamental|fps|rate|name|path|file|version|count|^num|comment|note|desc|serial|id$|header|frame|gain|mm$|ext[rt]$|^estim"
     "|expos|aspect|bias|noise|gyro|acc|imu|body|base(?:line)?$|overlap|resolutions|transform|aabb|scene|bound|render|^(?:[rp][12]?|[qef]|om|h[12]|t[0-9a-z]{0,4})$"
 )
 _LENS = re.compile(
-    "distor|dist[kp]?[0-9]|^dist(?!ance)|coef|lens|^k[0-9]|^p[0-9]|^s[1-4]$|tau|xi$|alpha|beta|gamma|model|skew|binn|roi|tang|radial|fisheye|omni|mirror"
+    "distor|dist[kp]?[0-9]|^dist(?!ance)|coef|lens|^[dk][0-9]|^[prt][0-9]|^s[1-4]$|tau|xi$|alpha|beta|gamma|model|skew|binn|roi|tang|radial|fisheye|omni|mirror"
     "|intrins|matrix|focal|princip|cent(?:er|re)|^[fc][xyuv]$|mapping|stretch|poly|affin|equi|^[dfk]$"
 )
 _MOST_NAMED = 12
@@ -321,16 +321,19 @@ class Keys(Mapping[str, Any]):
         Raises:
             ValueError: one of them may describe the lens.
         """
-        unknown = []
-        for key in set(self.content) - self.read:
-            value, name = self.content[key], bare(key)
+        unknown = sorted(self._unread(where))
+        return [f"not read: {', '.join(unknown[:_MOST_NAMED])}"] if unknown else []
+
+    def _unread(self, where: str) -> Iterator[str]:
+        for key in (key for key in self.content if key not in self.read):
+            value, name = self.content[key], re.sub("^cam(?:era)?(?=[a-z])", "", bare(key))
             name = (BEFORE.fullmatch(name) or ("", "", name))[2]
             found = flat(value)
             if isinstance(value, Mapping) and found is None and not OTHER.search(name):
-                unknown += Keys(value).rest(f"{where}{key}.")
+                yield from Keys(value)._unread(f"{where}{key}.")
             if not found or not any(found):
                 continue
-            if OTHER.search(name) and not (len(found) == 1 and name in ("p1", "p2", "f")):
+            if OTHER.search(name) and not (len(found) == 1 and re.fullmatch("[prt][12]|f", name)):
                 continue
             if _LENS.search(name) or 4 <= len(found) <= 14:
                 shape = f"{len(found)} numbers" if len(found) > 1 else f"{found[0]:g}"
@@ -338,8 +341,7 @@ class Keys(Mapping[str, Any]):
                     f"{where}{key} ({shape}) may describe the lens, and kcal does not know this name; rename it as the "
                     "format has it (camera_matrix, distortion_coefficients, ...), or delete it if it is no lens's"
                 )
-            unknown.append(f"{where}{key}")
-        return [f"not read: {', '.join(sorted(unknown)[:_MOST_NAMED])}"] if unknown else []
+            yield f"{where}{key}"
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from kcal.io.foreign import (
 )
 from kcal.io.keyed import read_keyed
 from kcal.lens.pose import Pose, rotation_from_vector
-from kcal.strict_formats import read_yaml
+from kcal.strict_formats import read_storage
 from kcal.strict_json import read_json
 
 # Cameras by their names, each with its values by the names of `kcal.io.keyed`, and notes.
@@ -176,7 +176,7 @@ def _zed(text: str, path: Path, hints: Hints) -> Found:
 
 def _euroc(text: str, path: Path, hints: Hints) -> Found:
     """T_BS leads from the sensor to the body; the files of two cameras are a rig."""
-    content = dict(read_yaml(text, str(path)))
+    content = read_storage(text.encode(), str(path))
     name = path.parent.name if path.stem == "sensor" else path.stem
     _give_pose(content, pose_of(content.pop("T_BS"), "T_BS").inverse())
     return {name: content | {"name": name}}, []

@@ -195,7 +195,7 @@ def recognized(path: Path) -> str:
         return _json_format(path, text)
     if (found := _XML.search(text)) is not None:
         return "qualisys" if found[0] == "<cameras" else "agisoft"
-    if re.search(r"^cam\d+\s*:|^cam0 \(.*\):", text, re.MULTILINE):
+    if re.search(r"^cam\d+\s*:(?s:.*)\bcamera_model\b|^cam0 \(.*\):", text, re.MULTILINE):
         return "kalibr"
     if suffix == ".xml" or "opencv-matrix" in text or text.startswith("%YAML"):
         return "opencv"
@@ -234,11 +234,13 @@ def _json_format(path: Path, text: str) -> str:
 
 
 # Keys that JSON files of a format have, and of programs whose files are not read.
-_UNREAD = {"views": "Meshroom", "sfm_data_version": "OpenMVG"}
+_UNREAD = {"views": "Meshroom", "sfm_data_version": "OpenMVG", "calib_dimension": "Gyroflow", "invpol": "OCamCalib"}
 _UNREAD_TEXT = {
     "OCamCalib": "^#polynomial coefficients for the DIRECT", "Bundler": r"\A# Bundle file", "VisualSFM": r"\ANVM_V3",
     "Hugin or PTGui": "^# (?:hugin|ptGui) project file", "Pix4D": r"\APix4D", "RealityCapture": r"\bxcr:",
-    "DSO": r"\A(?:Pinhole|RadTan|EquiDistant|FOV|KannalaBrandt)(?:\s+[-+.\de]+){4}",
+    "DSO": r"\A(?:(?:Pinhole|RadTan|EquiDistant|FOV|KannalaBrandt)(?:\s+[-+.\de]+){4}"
+           r"|(?:[-+.\de]+\s+){5,8}\d+ \d+\s+(?:crop|full|none))",
+    "Middlebury": r"\Acam0=\[",
 }  # fmt: skip
 _JSON = {
     "kcal": {"kcal"}, "ceres": {"kcal_prior"}, "basalt": {"value0"}, "multical": {"camera_poses"},

@@ -6,6 +6,7 @@ its shape, refuses the file: a lens must not become another one because a key is
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -21,6 +22,8 @@ from kcal.lens.camera_conversions import OPENCV_MODELS, ImageTransform
 from kcal.lens.pose import Pose, rotation_from_vector
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+# The same as vikit calls them (SVO, FAST-LIVO).
+_COUNTED = ("d0", "d1", "d2", "d3", "d4")
 _COEFS = "(?:coef+s?|coef+icients?|param(?:eter)?s?|vec(?:tor)?)"
 _IMAGE = "(?:image|img|frame|gray)?"
 # Names and how many numbers belong to them; -1 for a text or a switch.
@@ -30,32 +33,38 @@ _ROLES: dict[str, tuple[str, Sequence[int]]] = {
     "width": (f"{_IMAGE}(?:width|w)|imagecols", (1,)),
     "height": (f"{_IMAGE}(?:height|h)|imagerows", (1,)),
     "size": (f"{_IMAGE}(?:size|resolution|dims?|dimensions?)", (2,)),
-    "kind": ("(?:lens|distortion|dist|projection)?(?:model|type|modeltype|modelname)", (-1,)),
+    "kind": ("(?:lens|distortion|dist|projection|calib(?:ration)?|opencv)?(?:model|type|modeltype|modelname)", (-1,)),
     "fisheye": ("(?:is|use)?fisheye(?:model)?", (-1, 1)),
     "sigmas": ("std(?:ard)?dev(?:iation)?s?(?:intrinsics)?", range(4, 19)),
     "rotation": ("(?:stereo)?(?:r|rot(?:ation)?(?:matrix|mat|vector|vec)?|rmat)", (3, 9)),
     "translation": ("(?:stereo)?(?:t|trans(?:lation)?(?:vector|vec)?|tvec)", (3,)),
+    # ORB-SLAM3's first camera from the second, and OKVIS's body from a camera.
+    "second": ("(?:stereo)?tc1c2|tlr", (12, 16)),
+    "body": ("tsc", (16,)),
     "binning_x": ("binningx?", (1,)),
     "binning_y": ("binningy", (1,)),
     "roi": ("roi|regionofinterest", (-1,)),
     "fx": ("fx|flx|fu|focal(?:length)?x|gamma1|mu", (1,)),
     "fy": ("fy|fly|fv|focal(?:length)?y|gamma2|mv", (1,)),
-    "f": ("f|focal(?:length)?", (1,)),
+    "f": ("f|fc|focal(?:length)?", (1, 2)),
+    "center": ("cc|pp|center|principalpoint", (2,)),
     "cx": ("cx|cu|u0|ppx|(?:principal(?:point)?|center)x", (1,)),
     "cy": ("cy|cv|v0|ppy|(?:principal(?:point)?|center)y", (1,)),
-    **{name: (name, (1,)) for name in ("xi", "skew", *_COEFFICIENTS)},
+    **{name: (name, (1,)) for name in ("xi", "skew", *_COEFFICIENTS, *_COUNTED)},
 }
 _PATTERNS = {role: re.compile(f"(?:cam(?:era)?)?(?:{names})") for role, (names, _) in _ROLES.items()}
-_AFTER = re.compile(r"(.+?)(left|right|l|r|(?:cam(?:era)?)?[0-9])")
+_AFTER = re.compile(r"(.+?)(left|right|l|r|(?:cam(?:era)?)?[0-9]{1,3})")
 # Lenses of OpenCV, its fisheye, what both may be called, and lenses that are neither.
 _PLAIN = re.compile(
     "plumbbob|rational(?:polynomial)?|radtan8?|radialtangential|brown(?:conrady)?|opencv[0-9]*|standard|normal|thinprism|tilted"
+    "|rectilinear"
 )
-_FISHEYE = re.compile("fisheye|equi(?:distant)?|kannalabrandt[48]?|kb[48]?|opencvfisheye|fisheyeopencv")
-_EITHER = re.compile("|none|null|pinhole|perspective|camera|mono|monocular|stereo|central|rectified")
-# What is no name of a lens may be that of a product.
+_FISHEYE = re.compile("(?:(?:open)?cv2?)?fisheye(?:opencv)?|equi(?:distant)?|kannalabrandt[48]?|kb[48]?")
+_EITHER = re.compile("|none|null|generic|pinhole|perspective|camera|mono|monocular|stereo|central|rectified")
+# What is no name of a lens may be that of a product, or of a way to calibrate.
+_LOOSE = re.compile("(?:camera|calib(?:ration)?|opencv)?(?:type|model)")
 _FOREIGN = re.compile(
-    ".*(fish|omni|spher|ucm|mei|fov|divis|scara|ocam|poly|radial|prism|cahv|pano|equi|ortho|unified|brown)|ds|kb"
+    ".*(fish|omni|spher|ucm|mei|fov|atan|divis|scara|ocam|poly|radial|prism|cahv|pano|equi|ortho|unified|brown)|ds|kb"
 )
 _OMNI = re.compile("omni(?:dir|directional)?|mei")
 # Of RealSense, as `_realsense_lens` calls them; without distortion where all coefficients are zero.
@@ -73,7 +82,7 @@ def _role(key: str, value: Any) -> tuple[str, str] | None:
         for role, pattern in _PATTERNS.items():
             # A distance is one number; no list of coefficients is.
             if base and count in _ROLES[role][1] and pattern.fullmatch(base) and (role != "lens" or many):
-                return role, re.sub("cam(?:era)?", "", side or "")[:1]
+                return role, re.sub("cam(?:era)?|(?<=[lr])(?:eft|ight)", "", side or "")
     return None
 
 
@@ -118,11 +127,24 @@ class _Named:
         if (matrix := self.get("matrix", side)) is not None:
             found, key = foreign.flat(matrix) or [], self.key("matrix", side)
             # Four numbers that are called intrinsics are fx, fy, cx, cy.
-            return (found, 0.0) if len(found) == 4 and "intrin" in foreign.bare(key) else foreign.core_of(found, key)
-        fx = self.number("fx", side) or self.number("f", side)
-        if missing := [name for name in ("cx", "cy") if self.get(name, side) is None]:
+            four = len(found) == 4 and "intrin" in foreign.bare(key)
+            core, skew = (found, 0.0) if four else foreign.core_of(found, key)
+            self.agrees(("fx", "fy", "cx", "cy"), core, side, key)
+            return core, skew
+        focal, center = (foreign.flat(self.get(role, side)) or [] for role in ("f", "center"))
+        fx = self.number("fx", side, *focal[:1])
+        found = [fx, self.number("fy", side, *focal[1:] or [fx])]
+        found += [self.number(name, side, *center[i : i + 1] or [math.nan]) for i, name in enumerate(("cx", "cy"))]
+        if missing := [name for name, value in zip(("cx", "cy"), found[2:], strict=True) if math.isnan(value)]:
             raise ValueError(f"{' and '.join(missing)} of the principal point are missing")
-        return [fx, self.number("fy", side, fx), self.number("cx", side), self.number("cy", side)], 0.0
+        return found, 0.0
+
+    def agrees(self, names: Sequence[str], values: Sequence[float], side: str, key: str) -> None:
+        """Refuse numbers that the file states a second time, each by its name, if they differ."""
+        for name, value in zip(names, values, strict=False):
+            if (name, side) in self.at and abs(self.number(name, side) - value) > 1e-6 * abs(value):
+                raise ValueError(f"{key} and {self.key(name, side)} are both there and differ; delete the one that is "
+                                 "not meant")  # fmt: skip
 
     def kind(self, side: str, fisheye: bool | None, notes: list[str]) -> bool | str | None:
         """Whether the lens is a fisheye's, or the name of one of RealSense's; None if the file does not say.
@@ -147,7 +169,7 @@ class _Named:
                 raise ValueError(f"{key} {value}, but there are coefficients that are not zero; delete one of them")
             elif _EITHER.fullmatch(text) or (_OMNI.fullmatch(text) and ("xi", side) in self.at) or fisheye is not None:
                 continue
-            elif foreign.bare(key) in ("type", "model", "cameratype", "cameramodel") and not _FOREIGN.match(text):
+            elif _LOOSE.fullmatch(foreign.bare(key)) and not _FOREIGN.match(text):
                 notes.append(f"{key} {value}: no name of a lens model; not read")
             else:
                 raise ValueError(
@@ -184,24 +206,32 @@ def read_keyed(content: Mapping[str, Any], name: str, hints: foreign.Hints, titl
         ValueError: no camera, a lens that kcal does not have, or keys that it does not know.
     """
     notes: list[str] = []
-    inside = _cameras_inside(content)
+    inside, outer = _cameras_inside(content)
     if inside:
-        outer = {key: value for key, value in content.items() if key not in inside and foreign.bare(key) != "cameras"}
-        named = _Named(outer)
-        shared = {key: named.keys[key] for (role, _), key in named.at.items() if role in ("width", "height", "size")}
+        named, shared = _Named(_flattened(outer)), _for_all(outer)
+        named.keys.read.update(shared)
         parts = {
             str(part.get("name") or part.get("camera_name") or (key if len(inside) > 1 else name)): (
-                _Named(shared | _flattened(part)), "",
+                _Named(_with_shared(shared, part)), "",
             )
             for key, part in inside.items()
         }  # fmt: skip
+        if len(parts) == 2 and named.get("rotation") is not None:
+            # R and T are of the right or second camera, wherever that one stands in the file.
+            if len({re.sub("left|right|[lr]$|[0-9]+$", "", label.lower()) for label in parts}) == 1:
+                parts = dict(sorted(parts.items()))
+            else:
+                notes.append("R and T are taken as those of {1} from {0}".format(*parts))
     else:
         named = _Named(_flattened(content))
-        sides = sorted({side for role, side in named.at if role in ("matrix", "fx", "f")})
-        labels = ["left", "right"] if len(sides) == 2 else [f"camera{side}" for side in sides]
+        sides = sorted({side for role, side in named.at if role in ("matrix", "fx", "f")}, key=lambda one: one.zfill(3))
+        labels = ["left", "right"] if len(sides) == 2 else [
+            {"l": "left", "r": "right"}.get(side, f"camera{side}") for side in sides
+        ]  # fmt: skip
         parts = {label if len(sides) > 1 else name: (named, side) for label, side in zip(labels, sides, strict=True)}
     cameras, refused = foreign.each_readable(
-        (label, partial(_camera, *part, label, hints, notes)) for label, part in parts.items()
+        (label, partial(_camera, *part, label, hints, notes, "fish" in str(content).lower()))
+        for label, part in parts.items()
     )
     poses = _poses(named, list(parts.values()), hints, notes)
     if not parts and not poses:
@@ -216,21 +246,45 @@ def read_keyed(content: Mapping[str, Any], name: str, hints: foreign.Hints, titl
     )
 
 
-def _cameras_inside(content: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Mappings in it, or in its `cameras`, that have a camera each."""
+_SIZES, _KINDS = ("width", "height", "size"), ("kind", "fisheye")
+
+
+def _for_all(content: Mapping[str, Any], roles: Sequence[str] = (*_SIZES, *_KINDS)) -> dict[str, Any]:
+    """What a mapping says of all cameras inside it."""
+    found = {key: _role(key, value) for key, value in content.items()}
+    return {key: content[key] for key, role in found.items() if role is not None and role[0] in roles}
+
+
+def _with_shared(shared: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a camera, with those of all cameras; a size of its own is in place of theirs."""
+    own = _flattened(part)
+    left = _for_all(shared, _KINDS if _for_all(own, _SIZES) else (*_SIZES, *_KINDS))
+    return left | own
+
+
+def _cameras_inside(content: Mapping[str, Any]) -> tuple[dict[str, Mapping[str, Any]], dict[str, Any]]:
+    """Mappings in it, in its `cameras` or deeper, that have a camera each; and what else there is."""
     if has_camera(content):
-        return {}
-    tables = dict(content)
-    inside: Any = next((tables.pop(key) for key in list(tables) if foreign.bare(key) == "cameras"), {})
-    if isinstance(inside, list):
-        inside = {str(i): part for i, part in enumerate(inside)}
-    inside = inside if isinstance(inside, Mapping) else {}
-    # Blocks such as `projection_parameters` are parts of one camera.
-    own = {key: part for key, part in tables.items() if not re.search("param|intrin|proj", foreign.bare(key))}
-    return {
-        str(key): part for key, part in (own | inside).items()
-        if isinstance(part, Mapping) and "data" not in part and has_camera(_flattened(part))
-    }  # fmt: skip
+        return {}, dict(content)
+    outer, found = dict(content), dict[str, Mapping[str, Any]]()
+    listed: Any = next((outer.pop(key) for key in list(outer) if foreign.bare(key) == "cameras"), {})
+    if isinstance(listed, list):
+        listed = {str(i): part for i, part in enumerate(listed)}
+    listed = listed if isinstance(listed, Mapping) else {}
+    for key, part in (outer | listed).items():
+        if not isinstance(part, Mapping) or "data" in part:
+            continue
+        deeper, rest = _cameras_inside(part)
+        # Blocks such as `projection_parameters` are parts of one camera.
+        whole = key in listed or not re.search("param|intrin|proj", foreign.bare(key))
+        if len(deeper) < 2 and whole and has_camera(_flattened(part)):
+            found[str(key)] = part
+            outer.pop(key, None)
+        elif deeper:
+            shared = _for_all(rest)
+            found |= {f"{key} {name}": _with_shared(shared, one) for name, one in deeper.items()}
+            outer[key] = {name: value for name, value in rest.items() if name not in shared}
+    return found, outer
 
 
 def _flattened(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -238,45 +292,51 @@ def _flattened(content: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in content.items():
         block = isinstance(value, Mapping) and "data" not in value and _role(key, value) is None
-        # PhotonVision's board has a size, too.
-        block = block and "object" not in foreign.bare(key)
-        if block and any(map(_role, value, value.values())):
-            if twice := set(found) & set(value):
-                raise ValueError(
-                    f"{min(twice)} is there twice, in {key} and elsewhere; kcal cannot tell which is meant"
-                )
-            found |= value
-        else:
-            found[key] = value
+        # A board has a size, too.
+        block = block and not re.search("object|board|chess|pattern|target|marker", foreign.bare(key))
+        inner = value if block and any(map(_role, value, value.values())) else {key: value}
+        if twice := [one for one in inner if one in found and str(found[one]) != str(inner[one])]:
+            raise ValueError(f"{min(twice)} is there twice, in {key} and elsewhere; kcal cannot tell which is meant")
+        found |= inner
     if "mu" in found and "k5" in found:
         # camodocal counts the coefficients of its fisheye from k2.
         found = {f"k{int(key[1]) - 1}" if re.fullmatch("k[2-5]", key) else key: value for key, value in found.items()}
     return found
 
 
-def _camera(named: _Named, side: str, name: str, hints: foreign.Hints, notes: list[str]) -> Camera:
+def _camera(
+    named: _Named, side: str, name: str, hints: foreign.Hints, notes: list[str], speaks_of_fisheye: bool
+) -> Camera:
     stated_size = named.size(side)
     size = foreign.known_size(hints.size or stated_size)
     core, skew = named.core(side)
     matrix = named.key("matrix", side)
     fisheye = named.kind(side, hints.fisheye, notes)
-    stated = named.get("lens", side)
-    lens = _coefficients(named, side, fisheye is True) if stated is None else (foreign.flat(stated) or [])
+    stated, xi = named.get("lens", side), named.number("xi", side)
+    # A switch of VINS that says fisheye is one for its mask.
+    order = ("k1", "k2", "k3", "k4") if fisheye is True and not xi else _COEFFICIENTS
+    lens = _coefficients(named, side, order) if stated is None else (foreign.flat(stated) or [])
     key = named.key("lens", side) if stated is not None else "the coefficients k1, k2, p1, p2"
+    named.agrees(order, lens, side, key)
     if isinstance(fisheye, str):
         return _realsense_lens(
             fisheye, foreign.named_camera(name, core, size, "pinhole"), foreign.numbers(lens, 5, key), notes
         )
     if fisheye and len(lens) > 4 and not any(lens[4:]):
         lens = lens[:4]
-    if named.get("xi", side) is not None:
-        if len(lens) != 4 or skew:
-            raise ValueError("an omnidir camera has 4 coefficients and, here, no skew")
-        return foreign_camera("omni-radtan", name, core, size, [named.number("xi", side), *lens], notes)
+    if xi:
+        if len(lens) != 4:
+            raise ValueError(f"an omnidir camera has 4 coefficients, {key} has {len(lens)}")
+        return foreign_camera("omni-radtan", name, core, size, [xi, *lens], notes, skew)
     if fisheye and lens and len(lens) != 4:
         raise ValueError(f"a fisheye has 4 coefficients, {key} has {len(lens)}")
     lens = foreign.numbers(lens, (4,) if fisheye and lens else tuple(OPENCV_MODELS), key)
     if fisheye is None and len(lens) == 4 and stated is not None:
+        # OpenCV's other calibrations fit no skew.
+        if skew or speaks_of_fisheye:
+            why = f"{matrix} has a skew" if skew else "the file speaks of a fisheye"
+            raise ValueError(f"{key} may be k1 k2 p1 p2, or k1 to k4 of a fisheye, and {why}: say --fisheye or "
+                             "--no-fisheye")  # fmt: skip
         notes.append("4 coefficients read as k1 k2 p1 p2; if they are a fisheye's, use --fisheye")
     if not lens:
         notes.append(f"{name}: no coefficients of a lens in the file; read as one without distortion")
@@ -316,9 +376,9 @@ def _realsense_lens(kind: str, like: Camera, lens: list[float], notes: list[str]
     return camera
 
 
-def _coefficients(named: _Named, side: str, fisheye: bool) -> list[float]:
+def _coefficients(named: _Named, side: str, order: Sequence[str]) -> list[float]:
     """Those that have a name each: OpenCV's first 0, 4, 5 or 8, or the four of a fisheye."""
-    order = ("k1", "k2", "k3", "k4") if fisheye else _COEFFICIENTS
+    order = order if named.get("d0", side) is None else _COUNTED
     stated = [named.number(name, side) for name in order]
     last = max((i + 1 for i, name in enumerate(order) if named.get(name, side) is not None), default=0)
     return stated[: next(count for count in (0, 4, 5, 8) if count >= last)]
@@ -353,12 +413,15 @@ def _poses(
 ) -> tuple[Pose, ...]:
     """Of each camera, or of the second one of two from the first."""
     meters = hints.meters or 1.0
-    each = [part.get("rotation", side) is not None and part.get("translation", side) is not None and part is not named
+    each = [part is not named and (part.get("body", side) is not None or
+            (part.get("rotation", side) is not None and part.get("translation", side) is not None))
             for part, side in parts]  # fmt: skip
     if each and all(each):
         poses = [_pose_of_keys(part, side, meters) for part, side in parts]
     elif len(parts) in (0, 2) and named.get("rotation") is not None and named.get("translation") is not None:
         poses = [Pose.still(), _pose_of_keys(named, "", meters)]
+    elif len(parts) == 2 and named.get("second") is not None:
+        poses = [Pose.still(), _inverse_of(named, "second", "", meters)]
     else:
         if any(each):
             notes.append("some cameras have no rotation: no pose is read")
@@ -371,7 +434,14 @@ def _poses(
 
 
 def _pose_of_keys(named: _Named, side: str, meters: float) -> Pose:
+    if named.get("body", side) is not None:
+        return _inverse_of(named, "body", side, meters)
     turn = foreign.numbers(named.get("rotation", side), (3, 9), named.key("rotation", side))
     rotation = foreign.plain(rotation_from_vector(torch.tensor(turn, dtype=torch.float64))) if len(turn) == 3 else turn
     shift = foreign.numbers(named.get("translation", side), 3, named.key("translation", side))
     return foreign.checked_pose(rotation, [meters * value for value in shift])
+
+
+def _inverse_of(named: _Named, role: str, side: str, meters: float) -> Pose:
+    pose = foreign.pose_of(named.get(role, side), named.key(role, side)).inverse()
+    return Pose(pose.rotation, meters * pose.translation)

@@ -57,6 +57,11 @@ def ds(xi: float, alpha: float, k: Any = K) -> Pixels:
     return project
 
 
+def omnidir(xi: float, d: Any = F, k: Any = K) -> Pixels:
+    return lambda p: cv2.omnidir.projectPoints(p[:, None], np.zeros(3), np.zeros(3), np.array(k, float), xi,
+                                               np.array(d, float))[0][:, 0]  # fmt: skip
+
+
 def radial4(k1: float, k2: float, k3: float, k4: float, k: Any = K) -> Pixels:
     def project(p: np.ndarray) -> np.ndarray:
         plane = p[:, :2] / p[:, 2:]
@@ -122,6 +127,16 @@ NERF_LENS = {"distortion_params": [-0.1, 0.02, 0, 0, 0.001, 0.002]}
 NERF_FRAME = {"file_path": "a", "transform_matrix": np.eye(4).tolist()} | NERF_LENS
 FIELDS = " ".join(map(str, C))
 PANORAMA = COLMAP.format("EQUIRECTANGULAR", "", "640 480").replace("  ", " ")
+
+NUMBERS = dict(zip(("fx", "fy", "cx", "cy"), C, strict=True))
+VIKIT = {"model": "Pinhole", "width": 640, "height": 480, "scale": 0.5} | NUMBERS
+VIKIT |= {f"d{i}": d for i, d in enumerate(D[:4])}
+OKVIS = {"image_dimension": [640, 480], "distortion_coefficients": D[:4], "distortion_type": "radialtangential",
+         "focal_length": C[:2], "principal_point": C[2:]}  # fmt: skip
+MEI = ("%YAML:1.0\nmodel_type: MEI\nimage_width: 640\nimage_height: 480\nmirror_parameters: {xi: 1.2}\n"
+       "distortion_parameters: {k1: 0.05, k2: -0.01, p1: 0.002, p2: 0.001}\n"
+       "projection_parameters: {gamma1: 500, gamma2: 505, u0: 330, v0: 236}\n")  # fmt: skip
+BODY = f"T_BS: {{cols: 4, rows: 4, data: {np.eye(4).ravel().tolist()}}}\n"
 
 LENS_KEYS = ("distortion_coefficients", "dist_coeffs", "dist_coeff", "distortion_coeffs", "distortion", "distCoeffs",
              "Distortion_Coefficients", "D", "dist", "distortion_parameters", "DistCoef")  # fmt: skip
@@ -241,6 +256,35 @@ READ: dict[str, tuple[str, Any, Pixels]] = {
     "Kalibr radtan": ("c.yaml", kalibr("pinhole", "radtan", [], D[:4]), plain(d=D[:4])),
     "Kalibr equidistant": ("c.yaml", kalibr("pinhole", "equidistant", [], F), fisheye()),
     "Kalibr of OpenVINS": ("c.yaml", "%YAML:1.0\n\n" + kalibr("pinhole", "radtan", [], D[:4]), plain(d=D[:4])),
+    "vikit": ("a.yaml", "".join(f"cam_{key}: {value}\n" for key, value in VIKIT.items()), plain(d=D[:4])),
+    "parameters of a node": ("a.json", {"/**": {"ros__parameters": {"camera": VIKIT}}}, plain(d=D[:4])),
+    "two levels deep": ("a.json", {"0815": {"color": SIZE | {"K": M, "D": D}, "depth": SIZE | {"K": M}}}, plain()),
+    "OKVIS": ("a.yaml", f"%YAML:1.0\ncameras: {[OKVIS]}\nimu_params: {{tau: 3600.0}}\n", plain(d=D[:4])),
+    "two digits": ("a.json", SIZE | {"K_01": M, "dist_01": D, "K_12": M, "dist_12": F}, plain()),
+    "no Kalibr": ("a.yaml", f"cam0:\n  width: 640\n  height: 480\n  K: {M}\n  d: {D}\n  t: [0, 0, 1]\n", plain()),
+    "twice alike": (
+        "a.json",
+        {"width": 640, "height": 480, "intrinsic": {"width": 640} | NUMBERS, "K": M, "lens": {"k1": D[0]}, "D": D},
+        plain(),
+    ),
+    "a size of its own": (
+        "a.json",
+        {"width": 1280, "height": 960, "a": {"K": M, "D": D, "resolution": [640, 480]}, "b": {"K": M, "D": D}},
+        plain(),
+    ),
+    "a lens for all": ("a.json", SIZE | {"model": "fisheye", "a": {"K": M, "D": F}, "b": {"K": M, "D": F}}, fisheye()),
+    "calibration_model": ("a.json", SIZE | {"K": M, "D": F, "calibration_model": "cv2.fisheye"}, fisheye()),
+    "rectilinear": ("a.json", SIZE | {"K": M, "D": D, "distortion_model": "rectilinear"}, plain()),
+    "lengths in mm": ("a.json", SIZE | {"K": M, "D": D, "chip": {"focal_length_mm": 4.7}}, plain()),
+    "R3LIVE": ("a.json", {"vio": SIZE | {"camera_intrinsic": M, "camera_dist": D, "camera_ext_R": M}}, plain()),
+    "VINS with a mask": ("a.yaml", MEI + "fisheye: 1\n", omnidir(1.2)),
+    "omnidir with skew": (
+        "a.yml",
+        opencv("K", "D", F, "xi: 1.2\n").replace("500.0, 0.0", "500., 2."),
+        omnidir(1.2, k=SKEWED),
+    ),
+    "xi of zero": ("a.yml", opencv("K", "D", more="xi: 0.\ncalibration_model: generic\n"), plain()),
+    "EuRoC by OpenCV": ("a.yaml", opencv("K", "D", more=BODY), plain()),
     "Bouguet": ("Calib_Results.mat", BOUGUET, plain(SKEWED, D)),
     "MATLAB JSON": (
         "m.json",
@@ -261,6 +305,7 @@ READ: dict[str, tuple[str, Any, Pixels]] = {
 def test_read_as_it_is_meant(tmp_path: Path, case: str) -> None:
     name, content, pixels = READ[case]
     found = import_cameras(written(tmp_path, name, content))
+    assert found.cameras[0].size in ((640, 480), (600, 460)) or case in ("ROS binning", "ROS binned K")
     seen = found.cameras[0].project(torch.from_numpy(POINTS))[0].numpy()
     wanted = pixels(POINTS)
     if case == "Bouguet":
@@ -284,6 +329,31 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
         SIZE | {"projection_parameters": {"fx": 1.0}, "calib_parameters": {"fx": 2.0}},
         "fx is there twice",
     ),
+    "twice, one inside": (
+        "a.json",
+        {"intrinsic": NUMBERS | {"width": 640}, "width": 1280, "height": 480},
+        "width is there",
+    ),
+    "its own width": ("a.json", SIZE | {"camera": NUMBERS | {"width": 1280}}, "image size is not in the file"),
+    "two centers": ("a.json", SIZE | {"K": M, "D": D, "cx": 320}, "K and cx are both there and differ"),
+    "two lenses": ("a.json", SIZE | {"K": M, "D": D, "k2": 0.06}, "D and k2 are both there and differ"),
+    "d1 without d0": ("a.json", SIZE | NUMBERS | {"d1": -0.1}, "d1 .-0.1. may describe the lens"),
+    "r1 and t1": ("a.json", SIZE | NUMBERS | {"r1": -0.1, "t1": 0.01}, "r1 .-0.1. may describe the lens"),
+    "a lens by name of a block": (
+        "a.json",
+        SIZE | {"fisheye_params": {"K": M, "D": F}},
+        "speaks of a fisheye: say --f",
+    ),
+    "four with a skew": ("a.json", SIZE | {"K": SKEWED, "D": F}, "D may be .* K has a skew: say --fisheye"),
+    "size of a board": (
+        "a.json",
+        {"K": M, "D": D, "board": {"width": 9, "height": 6}},
+        "image size is not in the file",
+    ),
+    "vikit's ATAN": ("a.json", VIKIT | {"model": "ATAN"}, "model ATAN: kcal reads"),
+    "DSO": ("camera.txt", "0.53 0.67 0.49 0.51 0.9\n640 480\ncrop\n640 480\n", "a file of DSO"),
+    "Middlebury": ("calib.txt", "cam0=[500 0 330; 0 500 236; 0 0 1]\ndoffs=12\n", "a file of Middlebury"),
+    "Gyroflow": ("a.json", {"calib_dimension": {"w": 640}, "fisheye_params": {"camera_matrix": M}}, "of Gyroflow"),
     "misspelled": ("a.yml", opencv("K", "distrotion_coeffs"), "distrotion_coeffs .5 numbers. may describe the lens"),
     "by shape": ("a.json", SIZE | {"K": M, "verzeichnung": D}, "verzeichnung .5 numbers. may describe the lens"),
     "another matrix": (
@@ -434,6 +504,42 @@ def test_pairs(tmp_path: Path, keys: str) -> None:
     assert found.rig().right_from_left_translation.tolist() == pytest.approx([-0.6, 0, 0])
     unsaid = import_cameras(tmp_path / "a.json").notes
     assert any("taken as meters, 60 m" in note and "--unit cm" in note for note in unsaid)
+
+
+MOVE = np.eye(4)
+MOVE[:3, :3], MOVE[:3, 3] = cv2.Rodrigues(np.array([0.02, -0.1, 0.05]))[0], [-0.6, 0.01, 0.02]
+BACK = np.linalg.inv(MOVE)
+PART = SIZE | {"K": M, "D": D}
+TURN = {"R": MOVE[:3, :3].tolist(), "T": MOVE[:3, 3].tolist()}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"right": PART, "left": PART, "stereo": TURN},
+        TURN | {"cam1": PART, "cam0": PART},
+        {"Camera1.K": M, "Camera1.D": D, "Camera2.K": M, "Camera2.D": D, "Stereo.T_c1_c2": BACK.tolist()} | SIZE,
+        {"Camera.K": M, "Camera.D": D, "Camera2.K": M, "Camera2.D": D, "Tlr": BACK[:3].tolist()} | SIZE,
+        {"cameras": [OKVIS | {"T_SC": np.eye(4).ravel().tolist()}, OKVIS | {"T_SC": BACK.ravel().tolist()}]},
+    ],
+)
+def test_poses_of_pairs(tmp_path: Path, content: dict[str, Any]) -> None:
+    found = import_cameras(written(tmp_path, "a.yaml", f"%YAML:1.0\n{json.dumps(content)}"))
+    assert found.names in (("left", "right"), ("cam0", "cam1"), ("0", "1"))
+    assert np.abs(found.rig().right_from_left_rotation.numpy() - MOVE[:3, :3]).max() < 1e-12
+    assert found.rig().right_from_left_translation.tolist() == pytest.approx(MOVE[:3, 3])
+
+
+def test_of_other_pairs_it_is_said_which_is_the_second(tmp_path: Path) -> None:
+    notes = import_cameras(written(tmp_path, "a.json", {"rgb": PART, "ir": PART} | TURN)).notes
+    assert "R and T are taken as those of ir from rgb" in notes
+
+
+def test_cameras_of_each_device_keep_their_names(tmp_path: Path) -> None:
+    content = {"a": {"color": PART, "depth": PART}, "b": {"color": PART}, "rest": {"fps": 30.0, "info": {"gain": 2.0}}}
+    found = import_cameras(written(tmp_path, "a.json", content))
+    assert found.names == ("a color", "a depth", "b")
+    assert found.notes == ()
 
 
 def test_sections_of_an_ini_are_cameras(tmp_path: Path) -> None:
