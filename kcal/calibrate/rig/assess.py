@@ -96,13 +96,16 @@ def check_places(solution: RigSolution, names: Sequence[str], *, refuse: bool = 
 _MOST_BENT, _DIRECTIONS_TRIED = 1.0, 2
 
 
-def check_poses(solution: RigSolution, names: Sequence[str], *, refuse: bool = True) -> list[Finding]:
+def check_poses(
+    solution: RigSolution, names: Sequence[str], *, refuse: bool = True, because: Sequence[Finding] = ()
+) -> list[Finding]:
     """Widen the covariance where landmarks leave a camera's pose so open that it is not linear; return doubts.
 
     Args:
         solution: the rig; its root grows.
         names: of the cameras.
         refuse: raise an error where the pose could be anything; otherwise a doubt tells.
+        because: what has widened the covariance before; it is the reason then, not where the landmarks are.
 
     Raises:
         DegenerateError: a camera whose pose is so open; what to add is told.
@@ -134,6 +137,8 @@ def check_poses(solution: RigSolution, names: Sequence[str], *, refuse: bool = T
         if bent > _MOST_BENT:
             place, turn = length_text(float(sigma[:3].max()), digits=2), min(float(sigma[3:].max()), math.pi)
             text = f"the landmarks do not determine where {name} stands: ± {place}, ± {math.degrees(turn):.0f}° turned"
+            if refuse and because:
+                raise DegenerateError(f"{because[0].text}; so {text}. {because[0].action.capitalize()}")
             doubt = Finding("place", "doubt", text, _advice(problem, state))
             if refuse:
                 raise DegenerateError(doubt.sentence)
@@ -505,7 +510,7 @@ def rig_result(
     if widen > 1.0:
         solution = RigSolution(problem, state, widen**2 * fit.variance)
     apart = widen_for_fields(solution, data.names)
-    more = check_poses(solution, data.names, refuse=refuse)
+    more = check_poses(solution, data.names, refuse=refuse, because=apart)
     doubts += [] if doubts else more
     refuse_several(work, mask)
     against = contradicting_source(work, solution, refuse=refuse)

@@ -251,11 +251,12 @@ def contradicting_source(work: Adjustment, solution: RigSolution, *, refuse: boo
         off = rows[-1] + without.step @ rows[:-1]
         sigma = (rows[:-1].T @ without.root).square().sum(1).sqrt()
         verb, how = "contradicts", problem.terms[term].against(off, sigma)
-    others = " and ".join(filter(None, (", ".join(parts[i].name for i in rest[:-1]), parts[rest[-1]].name)))
-    text = (
-        f"{_name(parts, named)} {verb} {others}: {how} ({test.sigmas:.1f} standard deviations); measure again, correct "
-        "the value or its sigma, or leave it out"
-    )
+    against, cure = [parts[i].name for i in rest], "measure again, correct the value or its sigma, or leave it out"
+    if _test(parts, named, everything, _of_free_lenses(problem, known)).sigmas <= _DOUBT:
+        against.append("what is known of the lenses")
+        cure = f"are these the lenses, and images of the size, of the calibrations? If so, {cure}"
+    others = " and ".join(filter(None, (", ".join(against[:-1]), against[-1])))
+    text = f"{_name(parts, named)} {verb} {others}: {how} ({test.sigmas:.1f} standard deviations); {cure}"
     if equal:
         text += f"; it may as well be {' and '.join(_name(parts, group) for group in equal)} that is wrong"
     certain = test.sigmas > _CERTAIN
@@ -263,6 +264,14 @@ def contradicting_source(work: Adjustment, solution: RigSolution, *, refuse: boo
     if certain and refuse and own[named] <= 0:
         raise ContradictionError(text)
     return [Finding("contradiction", "stop" if certain else "doubt", text)]
+
+
+def _of_free_lenses(problem: RigProblem, known: Part) -> Part:
+    """What is known beforehand of all but the lenses."""
+    lenses = torch.cat(problem.unknowns.cameras).any(0).nonzero()[:, 0]
+    gram = known.gram.clone()
+    gram[lenses], gram[:, lenses] = 0.0, 0.0
+    return known._replace(gram=gram, rows=known.rows - len(lenses))
 
 
 def _sum(parts: Sequence[Part], chosen: Iterable[int], known: Part | None = None) -> Tensor:

@@ -33,6 +33,7 @@ from kcal.texts import length_text, measured_length
 _SIDEWAYS = 0.5
 # A feature is behind the cameras if its inverse range is negative by so many of its standard deviations.
 _BEHIND_SIGMAS = 4.0
+BEHIND = "its marks have negative parallax, as if it were behind the cameras: not the same point"
 # A single wrong match counts no more than an item that is three times worse than its sigmas.
 _MOST_BEHIND = 9.0
 # Meters: masts of a pair are 10 to 500 m apart, and landmarks that can be surveyed and marked stand before the horizon.
@@ -113,7 +114,8 @@ def swap_findings(data: RigData, solution: RigSolution) -> list[Finding]:
             text = f"the right camera is {-side:.3g} m to the left of the left camera: left and right are swapped"
             action = "exchange their cameras, observations and marks"
             found.append(Finding("swapped", "doubt", f"{text}{otherwise}", action))
-    behind, seen = _features_behind(solution)
+    over = _over_limit_behind(solution)
+    behind, seen = int((over > 1.0).sum()), len(over)
     if behind > seen / 2:
         text = (
             f"{behind} of {seen} features have negative parallax, as if they were behind the cameras: left and right "
@@ -162,16 +164,40 @@ def _rightward(data: RigData, state: RigState, left: int, right: int) -> Tensor:
     return across / torch.linalg.vector_norm(across)
 
 
-def _features_behind(solution: RigSolution) -> tuple[int, int]:
-    """How many features have an inverse range that is negative beyond chance, and how many there are."""
+def _over_limit_behind(solution: RigSolution) -> Tensor:
+    """(F,) how far features are behind the cameras, over the farthest that chance explains."""
     problem, state = solution.problem, solution.state
     for block, own in problem.parts(state):
         if isinstance(block, FeatureBlock):
             # The last local unknown is the inverse range; what the cameras' errors make of it is added.
             follow, alone = (value[:, -1] for value in problem.response(state, block))
             variance = solution.variances(follow) + alone[:, -1]
-            return int((own.items[:, 3] < -_BEHIND_SIGMAS * variance.sqrt()).sum()), len(block)
-    return 0, 0
+            return -own.items[:, 3] / (_BEHIND_SIGMAS * variance.sqrt())
+    return torch.zeros(0, dtype=torch.float64)
+
+
+def without_behind(work: Adjustment, mask: Tensor, kept: Tensor, solver: LMOptions) -> tuple[Tensor, Tensor]:
+    """Leave out features behind the cameras as well: nothing is there, and a wrong match on its line has no residual.
+
+    The worst is left out first, because it may put others behind. Most of them are behind where left and right are
+    swapped, which `swap_findings` tells.
+
+    Args:
+        work: at the solution of what was kept.
+        mask: items that may take part.
+        kept: those that agree.
+        solver: options of the solver.
+
+    Returns:
+        mask of the items that agree then, and of those behind.
+    """
+    behind, at = torch.zeros_like(mask), work.at("features")
+    while True:
+        over = _over_limit_behind(RigSolution(work.problem(kept), work.part(kept)))
+        if not 0 < int((over > 1.0).sum()) <= len(over) / 2:
+            return kept, behind
+        behind[at.start + kept[at].nonzero()[over.nan_to_num(0.0).argmax(), 0]] = True
+        kept = explained(work, mask & ~behind, solver)
 
 
 # Count what is left over to check where each camera of a rig stands.

@@ -20,7 +20,14 @@ from kcal.calibrate.problem.views import spread_out
 from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, all_of, possible
 from kcal.calibrate.rig.assess import rig_result
 from kcal.calibrate.rig.contradictions import widen_sources
-from kcal.calibrate.rig.explanations import cost_of_features_behind, explained, one_camera_doubts, refuse_same_camera
+from kcal.calibrate.rig.explanations import (
+    BEHIND,
+    cost_of_features_behind,
+    explained,
+    one_camera_doubts,
+    refuse_same_camera,
+    without_behind,
+)
 from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
 from kcal.calibrate.rig.pairs import Pair, evenly, paired_boards, pose_alone
 from kcal.calibrate.rig.result import Reasons, RigResult, records
@@ -290,7 +297,9 @@ def solve_rig(
     looking = ROUGHLY if unknowns.refine_lenses else options.solver
     progress("what contradicts the rest")
     if options.reject:
-        mask = kept = explained(work, mask, looking)
+        kept, behind = without_behind(work, mask, explained(work, mask, looking), looking)
+        reasons = {**reasons, **dict.fromkeys(behind.nonzero()[:, 0].tolist(), BEHIND)}
+        mask = kept
     else:
         mask = possible(work, mask)
         kept, doubts = _suspicions(work, mask, reasons, looking)

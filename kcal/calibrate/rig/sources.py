@@ -353,10 +353,9 @@ class Baseline(Measurement):
     def against(self, off: Tensor, sigma: Tensor) -> str:
         """See `Measurement.against`."""
         found, spread = self.length + self.sigma * float(off[0]), self.sigma * float(sigma[0])
-        return (
-            f"{self.length:.6g} ± {self.sigma:.2g} m was stated, and without it the cameras are {found:.6g} ± "
-            f"{spread:.2g} m apart"
-        )
+        # Without it even lenses may tell a distance, by how entrance pupils move, and any if they are wrong.
+        apart = f"the cameras are {found:.6g} ± {spread:.2g} m apart" if found > 0 else "no distance suits the rest"
+        return f"{self.length:.6g} ± {self.sigma:.2g} m was stated, and without it {apart}"
 
     def told(self, center: Tensor, names: Sequence[str]) -> list[ItemResidual]:
         """See `Measurement.told`."""

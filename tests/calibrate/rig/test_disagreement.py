@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal import RigData, solve_rig
+import kcal.calibrate.rig.assess
+from kcal import DegenerateError, RigData, solve_rig
 from kcal.calibrate.rig.contradictions import _RATIOS, _field_modes
 from kcal.calibrate.rig.result import RigResult
 from scripts.check.contradictions import boards, surveyed
@@ -73,6 +74,17 @@ def test_a_lens_that_errs_in_a_corner_is_told_with_its_place_and_widens_what_it_
     off = torch.stack([turned[2, 1], turned[0, 2], turned[1, 0]]).abs()
     assert float((off / sigmas(solved)).max()) > 3.0
     assert float((off / sigmas(bent)).max()) < 2.0
+
+
+def test_where_a_field_leaves_a_pose_open_it_is_named_and_not_the_landmarks(
+    clean: RigData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kcal.calibrate.rig.assess, "_MOST_BENT", 0.0)
+    for data, start in ((moved(clean, corner), "what right sees in the lower right"), (clean, "the landmarks do not")):
+        with pytest.raises(DegenerateError) as refusal:
+            solve_rig(data, STRAIGHT)
+        assert str(refusal.value).startswith(start)
+        assert ("Calibrate the lens" in str(refusal.value)) == (data is not clean)
 
 
 def test_the_covariance_is_that_of_a_solution_with_the_field_about_one_without(bent: RigResult) -> None:

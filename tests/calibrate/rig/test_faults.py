@@ -8,10 +8,20 @@ import re
 
 import pytest
 import torch
-from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, boards, features, landmarks, normal, see, tensor
+from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, boards, features, landmarks, normal, see, spread_points, tensor
 from torch import Tensor
 
-from kcal import Baseline, DegenerateError, InputError, Landmarks, MeasuredPosition, RigData, RigOptions, solve_rig
+from kcal import (
+    Baseline,
+    DegenerateError,
+    Features,
+    InputError,
+    Landmarks,
+    MeasuredPosition,
+    RigData,
+    RigOptions,
+    solve_rig,
+)
 from kcal.calibrate.rig import assess
 from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.contradictions import contradicting_source
@@ -162,6 +172,34 @@ class TestContradictions:
     def test_what_is_kept_is_told_all_the_same(self) -> None:
         found = solve_rig(data(landmarks=marked(), baselines=baseline(1.01 * APART, 0.001)), KEPT)
         assert any("the baseline left to right contradicts" in text for text in found.contradictions)
+
+    @pytest.mark.parametrize("zoom", [1.0, 1.01])
+    def test_a_lens_that_is_no_longer_as_calibrated_is_named(self, zoom: float) -> None:
+        """Near features tell of lenses, and nothing of a baseline: it is not to blame alone."""
+        truth = spread_points(100, 12.0, 60.0, 9)
+        pixels = torch.stack([see(truth, c) for c in (0, 1)], 1)
+        pixels = pixels[pixels.isfinite().all(-1).all(-1)]
+        middle = CAMERAS[1].params[2:4].detach()
+        pixels[:, 1] = middle + zoom * (pixels[:, 1] - middle)
+        unknown = torch.zeros(len(pixels)).double(), torch.full((len(pixels),), math.inf).double()
+        gables = Features(
+            names=tuple(map(str, range(len(pixels)))),
+            pixels=pixels + 0.1 * normal(pixels.shape, 4),
+            inverse_range=unknown[0],
+            inverse_range_sigma=unknown[1],
+            pixel_sigma=0.1,
+        )
+        options = dataclasses.replace(STRAIGHT, lens_change=0.5)
+        told = solve_rig(data(features=gables, baselines=baseline()), options).contradictions
+        assert bool(told) == (zoom != 1.0)
+        for text in told:
+            assert "contradict the baseline left to right and what is known of the lenses" in text
+            assert "are these the lenses" in text
+
+    def test_a_distance_that_cannot_be_is_not_told(self) -> None:
+        tape = baseline(2.0, 0.01)[0]
+        assert "are 3 ± 0.01 m apart" in tape.against(tensor(100.0), tensor(1.0))
+        assert "without it no distance suits the rest" in tape.against(tensor(-300.0), tensor(1.0))
 
     def test_good_sources_agree(self) -> None:
         for seed in range(2):

@@ -115,6 +115,19 @@ class TestSwap:
         assert text.startswith("8 of 8 features have negative parallax")
         assert "left and right marks are swapped" in text
 
+    def test_a_few_features_with_negative_parallax_are_left_out_and_named(self) -> None:
+        """A wrong match on its epipolar line has no residual; its lines meet behind the cameras."""
+        good, away = near(), spread_points(20, 60.0, 2000.0, 9)[:2] - CENTER[0]
+        pixels = good.pixels.clone()
+        # Where a point as far behind, on the same line of the left camera, would have its image.
+        pixels[:2, 1] = see(2.0 * CENTER[1] - CENTER[0] + 40.0 * away / away.norm(dim=-1, keepdim=True), 1)
+        wrong = dataclasses.replace(good, pixels=pixels)
+        data = RigData(cameras=CAMERAS[:2], names=("left", "right"), features=wrong, landmarks=landmarks(noise=0.1))
+        found = solve_rig(data)
+        assert {item.name for item in found.left_out} == {"gable 0", "gable 1"}
+        assert all("negative parallax" in item.reason for item in found.left_out)
+        assert found.warnings == ()
+
     def test_a_survey_in_millimeters_is_asked_for_its_unit(self) -> None:
         survey = landmarks(noise=0.1, error=0.02)
         large = dataclasses.replace(survey, points=1e3 * survey.points, sigma=1e3 * survey.sigma)
