@@ -196,8 +196,14 @@ def without_behind(work: Adjustment, mask: Tensor, kept: Tensor, solver: LMOptio
         over = _over_limit_behind(RigSolution(work.problem(kept), work.part(kept)))
         if not 0 < int((over > 1.0).sum()) <= len(over) / 2:
             return kept, behind
-        behind[at.start + kept[at].nonzero()[over.nan_to_num(0.0).argmax(), 0]] = True
-        kept = explained(work, mask & ~behind, solver)
+        worst, before = at.start + kept[at].nonzero()[over.nan_to_num(0.0).argmax(), 0], work.state
+        behind[worst] = True
+        try:
+            kept = explained(work, mask & ~behind, solver)
+        except InputError:
+            # The rest contradicts itself without it: sigmas tell that better than a refusal.
+            behind[worst], work.state = False, before
+            return kept, behind
 
 
 # Count what is left over to check where each camera of a rig stands.
