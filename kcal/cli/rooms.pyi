@@ -182,6 +182,7 @@ from kcal.stars.detect import time_of as time_of
 from kcal.stars.lens import StarCamera as StarCamera
 from kcal.stars.night import NamedStars as NamedStars
 from kcal.stars.night import clock_doubts as clock_doubts
+from kcal.stars.night import turn_by_lens as turn_by_lens
 from kcal.stars.rig_stars import moments_of as moments_of
 from kcal.strict_formats import read_npz as read_npz
 from kcal.watch.history import Temperatures as Temperatures

@@ -275,6 +275,13 @@ def stars_command(
     print_table([["image", "stars", "named", "RMS px", *angles, "left out"], *(_row(*one) for one in seen)])
     if views[0].on_earth and night.dut1 is None:
         out.print("UT1 - UTC is not known (--dut1): it is part of the σ about the Earth's axis with 8″")
+    turned = max(rooms.turn_by_lens(lens, found.detected.pixels[found.attitude.star >= 0]) for _, found in seen)
+    tell(lens_turn_deg=turned)
+    if turned > max(max(found.sigma_deg) for _, found in seen):
+        out.print(
+            f"σ is of attitudes under this lens: its principal point, not known better, may turn all of them by "
+            f"± {turned:.2g}°; where pixels look is not concerned"
+        )
     print_wrote(picture)
 
 

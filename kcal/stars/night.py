@@ -20,6 +20,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import fit_turn, seen_turned, vector_from_rotation
 from kcal.lens.projection import FAR
 from kcal.lens.rig import Origin
+from kcal.lens.uncertainty import pixel_slopes
 from kcal.locate.mounting import attitude
 from kcal.stars.detect import DetectedStars, detect_stars
 from kcal.stars.sky import identify, turn_between
@@ -281,7 +282,8 @@ class NamedStars:
         attitude: rotation from the frame of `directions` and what belongs to it.
         directions: (M, 3) of the catalog: east, north, up if `on_earth`, otherwise celestial.
         on_earth: whether the attitude is that on the Earth.
-        covariance: (3, 3) of the attitude about that frame's axes, rad², with clock, UT1 and air.
+        covariance: (3, 3) of the attitude about that frame's axes, rad², with clock, UT1 and air; under this lens
+            (`turn_by_lens`).
         warnings: what to doubt.
     """
 
@@ -408,6 +410,21 @@ def _on_earth(among: NamedStars, catalog: night_sky.StarCatalog, camera: Camera)
     return dataclasses.replace(
         among, attitude=on_ground, directions=there, on_earth=True, covariance=covariance, warnings=tuple(doubts)
     )
+
+
+def turn_by_lens(camera: Camera, pixels: Floats) -> float:
+    """One sigma, degrees, of the turn for which errors of the lens pass where stars (N, 2) are; 0 if none are known.
+
+    Its principal point and the camera's attitude make up for each other: together they say where pixels look.
+    """
+    known = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
+    if known is None:
+        return 0.0
+    wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
+    half = known.by_parameter(known.half())[:, wanted]
+    by_camera, by_motion, good = pixel_slopes(camera, torch.from_numpy(pixels), math.inf, wanted)
+    turns = torch.linalg.lstsq(by_motion[good][..., :3].flatten(0, 1), by_camera[good].flatten(0, 1) @ half.T).solution
+    return math.degrees(float(turns.norm(dim=1).max()))
 
 
 def _by_clock(view: SkyView) -> Tensor:

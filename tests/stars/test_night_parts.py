@@ -13,6 +13,7 @@ import torch
 
 from kcal import Camera, InputError
 from kcal.io.images import write_png, write_video
+from kcal.lens import CameraCalibration
 from kcal.stars.detect import (
     NightPlan,
     PlannedStars,
@@ -24,7 +25,7 @@ from kcal.stars.detect import (
     read_night,
     time_of,
 )
-from kcal.stars.night import _names_at, field_angle
+from kcal.stars.night import _names_at, field_angle, turn_by_lens
 from kcal.stars.sky import Identification, StarCatalog
 
 CAMERA = Camera.build(focal=(1000, 1000), center=(319.5, 239.5), size=(640, 480), model="pinhole")
@@ -195,3 +196,13 @@ def test_crowded_within_five_pixels_by_what_is_not_far_fainter() -> None:
     assert _uncrowded(place, peak).tolist() == [False, False, True, True, True, False, True]
     assert _uncrowded(place[:1], peak[:1]).tolist() == [True]
     assert _uncrowded(np.zeros((0, 2)), np.zeros(0)).tolist() == []
+
+
+def test_a_principal_point_passes_for_a_turn() -> None:
+    """2 px of it, near the middle of an image with a focal length of 1000 px."""
+    camera = Camera.build(focal=(1000, 1000), center=(319.5, 239.5), size=(640, 480), model="pinhole")
+    pixels = np.array([[319.5, 239.5], [330.0, 239.5], [319.5, 250.0], [310.0, 235.0]])
+    assert turn_by_lens(camera, pixels) == 0.0
+    covariance = torch.diag(torch.tensor([0.0, 0.0, 4.0, 0.0, 0.0], dtype=torch.float64))
+    camera.calibration = CameraCalibration(sigma=dict.fromkeys(camera.names), covariance=covariance)
+    assert turn_by_lens(camera, pixels) == pytest.approx(math.degrees(0.002), rel=1e-3)

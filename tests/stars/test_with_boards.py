@@ -278,6 +278,9 @@ def test_six_real_images(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)["images"]
     assert len(told) == 6
+    # A narrow lens: stars of three of these images give a lens whose attitudes are 0.05° off.
+    assert 0.03 < json.loads(done.stdout)["lens_turn_deg"] < 0.1
+    assert all(max(image["sigma_deg"]) < 0.005 for image in told)
     for image in told:
         # Altitude and azimuth of the axis stand in the names, roughly.
         altitude, azimuth = (float(part[3:]) for part in image["image"].split("_")[1:3])
