@@ -226,11 +226,6 @@ def view_data(products: Products, x: Tensor, motion: Tensor, freedom: float) -> 
     return ViewData(still=Quadratic(total, freedom, x), own=own, cross=cross, score=score[:, :-1])
 
 
-def still_data(rows: Tensor, x: Tensor, freedom: float) -> ViewData:
-    """From rows (V, S + 1, R) of views without poses and motions, at lens and board x; the residuals last."""
-    return view_data(Products.of_rows(rows, 0), x, rows.new_zeros(len(rows), 0), freedom)
-
-
 def overdispersion(score: Tensor, K: Tensor, deviation: Tensor, variance: float) -> float:
     """Scatter of the views' scores (V, S) over what independent corners explain, in directions that data determine."""
     score = score - score.mean(0)

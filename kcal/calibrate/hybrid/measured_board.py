@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from kcal.calibrate.hybrid.board_modes import KNOWN, BoardModes, board_modes, undetermined_modes
-from kcal.calibrate.hybrid.evidence import Amplitudes, maximize_evidence, still_data
+from kcal.calibrate.hybrid.evidence import Amplitudes, maximize_evidence, view_data
 from kcal.calibrate.hybrid.families import BOARD, Hyperprior, PriorFamilies, typical_hyperprior
 from kcal.corners.board import Board
 from kcal.errors import InputError
 from kcal.gaussian import Gaussian, numbered, stacked
 from kcal.lens.information import BOARD_SLOT, CameraInformation
 from kcal.native_file import NativeFile
+from kcal.solve.schur import Products
 from kcal.texts import brief, measured_text, number_text
 
 # What is known of a board, as Gaussians over the amplitudes of its modes: as printed, and what cameras tell of it.
@@ -117,7 +118,8 @@ def printed_board(modes: BoardModes, messages: Sequence[Gaussian]) -> tuple[Gaus
     prior = Hyperprior(typical.mean[BOARD:], typical.sd[BOARD:])
     zero, none = torch.zeros_like(unit), torch.full_like(modes.family, -1)
     families = PriorFamilies(zero, unit.log(), modes.family, none, zero)
-    data = still_data(stacked(messages).placed(numbered(BOARD_SLOT, len(unit)), zero).rows.T[None], zero, 0.0)
+    rows = stacked(messages).placed(numbered(BOARD_SLOT, len(unit)), zero).rows.T[None]
+    data = view_data(Products.of_rows(rows, 0), zero, zero.new_zeros(1, 0), 0.0)
     # Messages are in standard deviations already.
     found = maximize_evidence(data, families, Amplitudes(prior.mean, 1.0), prior, known_noise=True)
     return printed_prior(modes, found.h), -found.loss

@@ -14,7 +14,7 @@ from kcal import Board, InputError
 from kcal.calibrate.hybrid.base_fit import Base, _through_base, _with_constants
 from kcal.calibrate.hybrid.board_modes import BENDING, KNOWN, PRINT, STRETCH, TRAPEZOID, board_modes, undetermined_modes
 from kcal.calibrate.hybrid.cameras_fit import _but_one, fleet_priors, typical_lens
-from kcal.calibrate.hybrid.evidence import Amplitudes, Quadratic, overdispersion, posterior_root, still_data, view_data
+from kcal.calibrate.hybrid.evidence import Amplitudes, Quadratic, overdispersion, posterior_root, view_data
 from kcal.calibrate.hybrid.families import LensPrior, PriorFamilies, prior_families, typical_hyperprior
 from kcal.calibrate.hybrid.fit import pixels_are_square, with_square_pixels
 from kcal.calibrate.hybrid.fitted_views import Estimate
@@ -283,7 +283,7 @@ class TestQuadratics:
 
     def test_data_of_still_views(self) -> None:
         rows = draw(2, 4, 5)
-        found = still_data(rows, tensor(1.0, 2.0, 3.0), 7.0)
+        found = view_data(Products.of_rows(rows, 0), tensor(1.0, 2.0, 3.0), rows.new_zeros(2, 0), 7.0)
         torch.testing.assert_close(found.still.products, (rows @ rows.mT).sum(0))
         assert not found.moving
         torch.testing.assert_close(found.score, (rows[:, :3] @ rows[:, 3:].mT)[..., 0])
