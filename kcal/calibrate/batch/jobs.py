@@ -177,11 +177,6 @@ def hash_of(*parts: object) -> str:
     return hashlib.sha256(repr((kcal.__version__, *parts)).encode()).hexdigest()[:32]
 
 
-def detection_key(digest: str, board: Board, refine: str) -> str:
-    """Name the detection of one image; `digest` is the hash of the file's bytes."""
-    return hash_of("detected", digest, board.model_dump_json(), refine)
-
-
 def detect_image(path: str, board: Board, options: BatchOptions) -> Detected:
     """Find the board in one image."""
     with work_limit(options.time_limit):

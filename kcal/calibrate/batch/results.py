@@ -20,7 +20,7 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     wait,
 )
-from contextlib import contextmanager, suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -34,7 +34,6 @@ from kcal.calibrate.batch.jobs import (
     calibrated,
     calibration_options,
     detect_image,
-    detection_key,
     hash_of,
     observations_of,
     pieces,
@@ -42,6 +41,7 @@ from kcal.calibrate.batch.jobs import (
 )
 from kcal.calibrate.camera.calibrate import ALONE, sharing
 from kcal.calibrate.camera.result import HYBRID, CameraCalibrationResult
+from kcal.corners.detect import limit_threads
 from kcal.corners.images import image_bytes
 from kcal.corners.observations import Observations
 from kcal.errors import FileError, InputError, KcalError
@@ -178,7 +178,7 @@ class Results:
             yield from self._detected(number, i, Detected(reason=str(error).removeprefix(f"{path}: ")))
             return
         self._digests[number][i] = digest
-        key = detection_key(digest, board, self.options.refine)
+        key = hash_of("detected", digest, board.model_dump_json(), self.options.refine)
         kept = self._load(Detected, key)
         if kept is not None:
             yield from self._detected(number, i, kept)
@@ -188,17 +188,14 @@ class Results:
     def done(self, task: Task, outcome: Any) -> list[Task]:
         """Keep the outcome of a task; return the calibration that has become possible."""
         kind, number, i, key = task.tag
-        if kind == "image":
-            if isinstance(outcome, Detected):
-                self._keep(key, outcome)
-            else:
-                # Not kept: more memory or time may help.
-                outcome = Detected(reason=_failure_text(outcome))
-            return self._detected(number, i, outcome)
-        if isinstance(outcome, Calibrated):
+        if isinstance(outcome, NativeFile):
             self._keep(key, outcome)
         else:
-            outcome = Calibrated(error=_failure_text(outcome))
+            # Not kept: more memory or time may help.
+            why = _failure_text(outcome)
+            outcome = Detected(reason=why) if kind == "image" else Calibrated(error=why)
+        if kind == "image":
+            return self._detected(number, i, outcome)
         self._finish(number, outcome)
         return []
 
@@ -347,9 +344,7 @@ def write_summary(path: Path, rows: list[SummaryRow]) -> Path:
 
 
 def _failure_text(error: Exception) -> str:
-    if isinstance(error, KcalError | WorkerDiedError):
-        return str(error)
-    return f"{type(error).__name__}: {error}"
+    return str(error) if isinstance(error, KcalError) else f"{type(error).__name__}: {error}"
 
 
 # Run many pieces of work on many processes; each returns a result or a reason, even if its process dies.
@@ -420,9 +415,7 @@ class Pool:
                 self._executor = ProcessPoolExecutor(self.workers, mp_context=context, initializer=_begin)
         try:
             with deaf_to_interrupts():
-                if self._client is not None:
-                    return self._executor.submit(_in_one_thread, task.function, *task.arguments)
-                return self._executor.submit(task.function, *task.arguments)
+                return self._executor.submit(_in_one_thread, task.function, *task.arguments)
         except (RuntimeError, OSError, ValueError) as error:
             # What a closed Dask client raises; a broken pool of processes is the caller's to mend.
             if self._client is None:
@@ -466,14 +459,9 @@ class Pool:
                 self._client.close(timeout=5)
 
 
-@contextmanager
-def pool(workers: int, scheduler: str | None = None) -> Iterator[Pool]:
+def pool(workers: int, scheduler: str | None = None) -> closing[Pool]:
     """A `Pool` that is closed at the end, also after an interruption."""
-    opened = Pool(workers, scheduler)
-    try:
-        yield opened
-    finally:
-        opened.close()
+    return closing(Pool(workers, scheduler))
 
 
 def run_tasks(tasks: Iterable[Task], done: Done, workers: Pool) -> None:
@@ -535,10 +523,9 @@ def _result_of(future: Future[Any]) -> Any:
 
 
 def _begin() -> None:
-    """In a new process: leave Ctrl-C to the parent, end when the parent is gone, use one thread."""
+    """In a new process: leave Ctrl-C to the parent, end when the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _one_thread()
 
 
 def _end_with_parent() -> None:
@@ -548,16 +535,9 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _one_thread() -> None:
-    """Use one thread in this process: there are as many processes as cores."""
-    from kcal.corners.detect import limit_threads
-
-    limit_threads(1)
-
-
 def _in_one_thread(function: Callable[..., Any], *arguments: Any) -> Any:
-    """A task on a worker of a scheduler, which may have been started a moment ago, after another one died."""
-    _one_thread()
+    """A task on one of as many workers as cores, which may have been started a moment ago, after another one died."""
+    limit_threads(1)
     return function(*arguments)
 
 

@@ -15,6 +15,7 @@ from kcal.calibrate.camera.hybrid import (
     calibrate_what_fits,
     hybrid_result,
     lasting_findings,
+    leaving_out,
     listed_views,
     without_views,
 )
@@ -175,29 +176,28 @@ def calibrate_camera(
         # Each view is for itself.
         return _calibrate(observations, options, progress)
     if unusable := unusable_views(observations.board.points, observations.pixels()):
-        kept = [name for i, name in enumerate(observations.names) if i not in unusable]
-        if len(kept) < MINIMUM_VIEWS:
+        usable = leaving_out(observations, unusable)
+        if len(usable.views) < MINIMUM_VIEWS:
             raise DegenerateError(
-                f"{len(kept)} of {len(observations.views)} views of the board can be used, and at "
+                f"{len(usable.views)} of {len(observations.views)} views of the board can be used, and at "
                 f"least {MINIMUM_VIEWS} at different tilts are "
                 f"needed, 10 to 40 are good; of no use: {listed_views(observations, unusable)}"
             )
-        return without_views(calibrate_camera(observations.subset(kept), options, progress), observations, unusable)
+        return without_views(calibrate_camera(usable, options, progress), observations, unusable)
     pixels, copied = observations.pixels(), copied_views(observations.pixels(), 0.0)
     _check_spacing(observations, options, progress)
-    result = _calibrate(_without_copies(observations, copied), options, progress)
+    result = _calibrate(leaving_out(observations, copied), options, progress)
     if (nearly := copied_views(pixels, result.noise)) != copied:
         progress(f"{len(nearly)} views are copies of others; again without them")
         copied = nearly
-        result = _calibrate(_without_copies(observations, copied), options, progress)
+        result = _calibrate(leaving_out(observations, copied), options, progress)
     checked = lenses_by_view(result, options, progress)
     if not isinstance(checked, CameraCalibrationResult):
         left = [view.name for view in result.observations.views]
         wrong = {observations.names.index(left[i]): why for i, why in checked.items()}
         wrong |= {i: wrong[first] for i, first in copied.items() if first in wrong}
         progress(f"again without {len(wrong)} views of another camera")
-        kept = [name for i, name in enumerate(observations.names) if i not in wrong]
-        return without_views(calibrate_camera(observations.subset(kept), options, progress), observations, wrong)
+        return without_views(calibrate_camera(leaving_out(observations, wrong), options, progress), observations, wrong)
     return _complete(checked, observations, copied)
 
 
@@ -214,12 +214,6 @@ def _check_spacing(observations: Observations, options: CalibrationOptions, prog
         return
     if found:
         raise InputError(found[0].sentence)
-
-
-def _without_copies(observations: Observations, copied: Mapping[int, int]) -> Observations:
-    return observations.model_copy(
-        update={"views": tuple(view for i, view in enumerate(observations.views) if i not in copied)}
-    )
 
 
 def _complete(

@@ -86,9 +86,7 @@ def _alike(pixels: Tensor, limit: Tensor) -> dict[int, int]:
 
 def _nearby(pixels: Tensor, seen: Tensor, limit: Tensor) -> Iterator[list[int]]:
     """For each view the earlier ones that may be that near: none is missed, but rounding lets some through."""
-    filled = torch.where(seen[..., None], pixels, 0.0)
-    middle = filled.sum((0, 1)) / seen.sum()
-    filled = torch.where(seen[..., None], pixels - middle, 0.0)
+    filled = torch.where(seen[..., None], pixels - pixels[seen].mean(0), 0.0)
     mask, flat, square = seen.to(pixels.dtype), filled.flatten(1), filled.square().sum(-1)
     slack = _ROUNDING * square.sum(-1).max()
     for start in range(0, len(pixels), _AT_A_TIME):
@@ -148,12 +146,10 @@ def mirrored_views(board_points: Tensor, pixels: Tensor) -> Tensor:
         [False, False, True]
     """
     seen = pixels.isfinite().all(-1, keepdim=True)
-    count = seen.sum(1, keepdim=True).clamp_min(1)
-    flat = torch.where(seen, board_points[:, :2], 0.0)
-    shown = torch.where(seen, pixels, 0.0)
+    flat = torch.where(seen, board_points[:, :2], torch.nan)
     # The sign of an affine map's determinant is that of the moments between both sides.
-    flat = torch.where(seen, flat - flat.sum(1, keepdim=True) / count, 0.0)
-    return torch.linalg.det(flat.transpose(1, 2) @ shown) < 0
+    flat = (flat - flat.nanmean(1, keepdim=True)).nan_to_num(0.0)
+    return torch.linalg.det(flat.transpose(1, 2) @ torch.where(seen, pixels, 0.0)) < 0
 
 
 def unusable_views(board_points: Tensor, pixels: Tensor) -> dict[int, str]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -290,10 +290,8 @@ def _without(
 ) -> CameraCalibrationResult:
     """Without views that do not fit."""
     progress(f"without {len(wrong)} views that no lens fits")
-    kept = [i for i in range(len(observations.views)) if i not in wrong]
-    used = observations.subset([observations.names[i] for i in kept])
     try:
-        result = calibrate_hybrid(used, options, progress)
+        result = calibrate_hybrid(leaving_out(observations, wrong), options, progress)
     except _FAILED as error:
         listed = listed_views(observations, wrong)
         raise InputError(f"without {len(wrong)} views that no lens fits ({listed}): {error}") from failure
@@ -345,6 +343,11 @@ def _few_names(names: Sequence[str]) -> str:
 def listed_views(observations: Observations, wrong: Mapping[int, str]) -> str:
     """Names of views with their reasons, a few of them."""
     return _few_names([f"{observations.names[i]} ({why})" for i, why in wrong.items()])
+
+
+def leaving_out(observations: Observations, views: Collection[int]) -> Observations:
+    """The observations without some views."""
+    return observations.subset([name for i, name in enumerate(observations.names) if i not in views])
 
 
 def without_views(

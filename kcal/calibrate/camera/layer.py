@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -58,9 +58,8 @@ def exact_minimum(problem: BoardProblem, state: BoardState) -> tuple[BoardState,
 # A camera's minimum as tensors of autograd's graph: the parametric problem's and the default lens's alike.
 
 Backward = Literal["implicit", "unroll", "none"]
-S = TypeVar("S")
 # A problem of detached or of differentiable data.
-ProblemOf = Callable[..., Any]
+ProblemOf = Callable[..., BoardProblem]
 
 # Steps that are recorded by backward="unroll"; each multiplies the error of the derivative by the share of the
 # curvature that the Gauss-Newton approximation omits.
@@ -68,8 +67,8 @@ _UNROLLED = 8
 
 
 def differentiated(
-    problem_of: ProblemOf, data: tuple[Tensor, ...], state: S, found: HessianSolve, backward: Backward
-) -> S:
+    problem_of: ProblemOf, data: tuple[Tensor, ...], state: BoardState, found: HessianSolve, backward: Backward
+) -> BoardState:
     """A minimum with its derivatives by the data.
 
     Args:
@@ -88,8 +87,7 @@ def differentiated(
         problem, here = problem_of(*(tensor.detach() for tensor in data)), state
 
         def cost(shared: Tensor, local: Tensor, *values: Tensor) -> Tensor:
-            value: Tensor = problem_of(*values).cost(problem.retract(here, (shared, local)))
-            return value
+            return problem_of(*values).cost(problem.retract(here, (shared, local)))
 
         state = problem.retract(state, implicit_step(cost, found, data))
     return state
@@ -152,8 +150,7 @@ class CalibratedViews:
 
     def to(self, device: torch.device | str) -> CalibratedViews:
         """The same on another device; `fit` and `hybrid`, from which a next calibration starts, stay on the CPU."""
-        own = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
-        moved: dict[str, Any] = {name: value.to(device) for name, value in own.items() if isinstance(value, Tensor)}
+        moved = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
         return dataclasses.replace(self, **moved)
 
     def state(self) -> BoardState:

@@ -230,17 +230,16 @@ def seen_pixels(result: CameraCalibrationResult) -> Tensor:
 
 def _splits(names: list[str]) -> list[tuple[str, bool, tuple[list[str], list[str]]]]:
     """Every other view; and by the beginning of names where there are two kinds of them, else by order."""
-    found = [("every other view", True, (names[::2], names[1::2]))]
     kinds: dict[str, list[str]] = {}
     for name in names:
         kinds.setdefault(re.split(r"\d", name.rpartition("/")[2], maxsplit=1)[0], []).append(name)
     if len(kinds) == 2 and min(map(len, kinds.values())) >= FEWEST_IN_HALF:
         (one, first), (other, second) = kinds.items()
-        found.append((f"images {one}… and {other}…", False, (first, second)))
+        label = f"images {one}… and {other}…"
     else:
         middle = len(names) // 2
-        found.append(("first and second half", False, (names[:middle], names[middle:])))
-    return found
+        label, first, second = "first and second half", names[:middle], names[middle:]
+    return [("every other view", True, (names[::2], names[1::2])), (label, False, (first, second))]
 
 
 def _half(
@@ -652,8 +651,7 @@ def interval_check(result: CameraCalibrationResult, ranges: Sequence[float], ref
     # Where the camera has no ray, there is nothing to compare.
     eye = torch.eye(2, dtype=torch.float64).expand_as(stated)
     known = stated.isfinite().all(-1).all(-1)
-    shape = (len(ranges), *pixels.shape[:2])
-    errors = torch.stack([one.errors for one in kept]).reshape(len(kept), *shape, 2)
+    errors = torch.stack([one.errors for one in kept]).unflatten(2, pixels.shape[:2])
     return IntervalCheck(
         pixels=pixels,
         ranges=tuple(ranges),

@@ -553,16 +553,12 @@ class BoardProblem(SchurProblem[BoardState]):
             own = self._of_all(torch.einsum("vaun,vbun->vabn", slopes, slopes), 0.0).sum(0)
             own = torch.einsum("abn,nm->anbm", own, torch.eye(own.shape[-1], dtype=own.dtype)).flatten(2).flatten(0, 1)
             beside = with_rows[:, L:].sum(0)
-            right = torch.cat([right[..., :-1], with_rows[:, :L], right[..., -1:]], -1)
-            score = torch.cat([score[..., :-1], with_rows[:, -1], score[..., -1:]], -1)
-            above, below = total.split([len(total) - 1, 1])
-            total = torch.cat(
-                [
-                    torch.cat([above[:, :-1], beside[:-1], above[:, -1:]], 1),
-                    torch.cat([beside[:-1].T, own, beside[-1:].T], 1),
-                    torch.cat([below[:, :-1], beside[-1:], below[:, -1:]], 1),
-                ]
-            )
+            right = torch.cat([with_rows[:, :L], right], -1)
+            score = torch.cat([with_rows[:, -1], score], -1)
+            total = torch.cat([torch.cat([own, beside.T], 1), torch.cat([beside, total], 1)])
+            # Displacements come after the other unknowns.
+            order = torch.arange(len(total) - 1).roll(-len(own))
+            return Products(local, right, score, total).of_shared(order)
         return Products(local, right, score, total)
 
     def linearize(self, state: BoardState) -> SchurLinearization:

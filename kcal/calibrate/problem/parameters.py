@@ -224,17 +224,17 @@ class CoefficientPrior:
             >>> [round(float(value), 6) for value in sigma]
             [1.2, 4.8, 0.02, 0.02]
         """
-        r, names = min(self.reach, _FARTHEST), parameter_names(model)
+        r = min(self.reach, _FARTHEST)
         # Tangential and tilt terms grow with the square of the radius.
         shift = dict.fromkeys(range(model.size), r / _ASSEMBLY)
         for orders in (model.numerator_index, model.denominator_index):
             shift |= {i: r ** (2 * j + 2) for j, i in enumerate(orders)}
         for orders in model.prism_index if model.prism else ():
             shift |= {i: r ** (2 * j + 1) / _ASSEMBLY for j, i in enumerate(orders)}
-        offset = len(INTRINSICS)
-        index = [offset + i for i in shift if names[offset + i] not in without]
-        weight = torch.tensor([noise * shift[i - offset] / self.width for i in index], dtype=torch.float64)
-        return GaussianPrior(torch.tensor(index, dtype=torch.long), torch.zeros_like(weight), weight)
+        kept = [i for i in shift if model.names[i] not in without]
+        weight = torch.tensor([noise * shift[i] / self.width for i in kept], dtype=torch.float64)
+        index = torch.tensor(kept, dtype=torch.long) + len(INTRINSICS)
+        return GaussianPrior(index, torch.zeros_like(weight), weight)
 
 
 def is_overparameterized(model: LensModel) -> bool:

@@ -192,15 +192,11 @@ def refine_poses(views: Views, model: LensModel, state: BoardState, options: LMO
         the state with refined board poses, and the cost of each view (V,), without a robust loss; NaN where the initial
         pose had none.
     """
-    count, weights = len(views.pixels), views.whitening
-    each = Views(
-        board_points=views.board_points,
-        pixels=views.pixels[:, None],
-        whitening=None if weights is None else weights[:, None],
-    )
+    count, weights = len(views.pixels), None if views.whitening is None else views.whitening[:, None]
+    problem = BoardProblem(views.board_points, views.pixels[:, None], model, weights=weights, batch=(count,))
     camera = state.parameters.expand(count, -1), state.board.expand(count, -1)
     start = BoardState.still(*camera, state.rotation[:, None], state.translation[:, None])
-    result = minimize(each.problem(model, batch=(count,)), start, options)
+    result = minimize(problem, start, options)
     poses = result.state
     return state._replace(rotation=poses.rotation[:, 0], translation=poses.translation[:, 0]), result.cost
 
@@ -319,7 +315,6 @@ class Views:
         free: Sequence[int] | FreeParameters = (),
         *,
         terms: Sequence[Term] = (),
-        batch: tuple[int, ...] = (),
     ) -> BoardProblem:
         """The least-squares problem of these views; without free parameters, of the poses (and the warp) alone."""
         return BoardProblem(
@@ -331,7 +326,6 @@ class Views:
             weights=self.whitening,
             loss=self.loss,
             terms=terms,
-            batch=batch,
         )
 
     def some(self, chosen: Sequence[int] | Tensor) -> Self:
