@@ -150,7 +150,7 @@ class CalibratedViews:
 
     def to(self, device: torch.device | str) -> CalibratedViews:
         """The same on another device; `fit` and `hybrid`, from which a next calibration starts, stay on the CPU."""
-        moved = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        moved: dict[str, Any] = {n: own.to(device) for n, own in vars(self).items() if isinstance(own, Tensor)}
         return dataclasses.replace(self, **moved)
 
     def state(self) -> BoardState:
