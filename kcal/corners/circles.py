@@ -87,9 +87,8 @@ def fit_ellipses(image: npt.NDArray[np.generic], center: Tensor, shape: Tensor, 
     on = torch.arange(len(p))  # those that have not converged
     for _ in range(_STEPS):
         diagonal = normal[on].diagonal(dim1=-2, dim2=-1)
-        damped = normal[on] + torch.diag_embed(
-            lam[on, None] * diagonal + 1e-9 * diagonal.amax(-1, keepdim=True).clamp_min(1e-30)
-        )
+        added = lam[on, None] * diagonal + 1e-9 * diagonal.amax(-1, keepdim=True).clamp_min(1e-30)
+        damped = normal[on] + torch.diag_embed(added)
         move = -torch.linalg.solve_ex(damped, gradient[on, :, None])[0][..., 0]
         move[:, :2] *= (0.3 * size[on] / move[:, :2].norm(dim=-1).clamp_min(1e-12)).clamp_max(1.0)[:, None]
         trial = p[on] + move
@@ -272,10 +271,7 @@ def _term_values(at: Tensor, terms: list[tuple[int, int]]) -> list[Tensor]:
     x, y = at.unbind(-1)
 
     def power(t: Tensor, n: int, derivative: int) -> Tensor:
-        factor = 1
-        for k in range(derivative):
-            factor *= n - k
-        return factor * t ** (n - derivative) if n >= derivative else torch.zeros_like(t)
+        return math.perm(n, derivative) * t ** (n - derivative) if n >= derivative else torch.zeros_like(t)
 
     orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     return [torch.stack([power(x, i, a) * power(y, j, b) for i, j in terms], -1) for a, b in orders]
@@ -452,10 +448,9 @@ def _detector(pixels: int, circularity: float = 0.0) -> cv2.SimpleBlobDetector:
 
 def _find_grid(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.pattern == "asymmetric" else cv2.CALIB_CB_SYMMETRIC_GRID
+    size, detector = (board.columns, board.rows), _detector(image.size)
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
-        found, centers = in_new_thread(
-            cv2.findCirclesGrid, image, (board.columns, board.rows), None, flags, _detector(image.size)
-        )
+        found, centers = in_new_thread(cv2.findCirclesGrid, image, size, None, flags, detector)
         if found:
             return torch.from_numpy(np.asarray(centers, np.float64).reshape(-1, 2))
     return None
@@ -472,8 +467,7 @@ def _goes_on(blobs: Tensor, pixels: Tensor, board: Board) -> bool:
     beside = [grid[:, 0] - torch.tensor([step, 0.0]), grid[:, -1] + torch.tensor([step, 0.0])]
     # The next row but one of asymmetric circles is a shift of a row, the next one of the row before.
     up, down = (grid[1], grid[-2]) if board.pattern == "asymmetric" else (grid[0], grid[-1])
-    rows = 2.0 if board.pattern == "asymmetric" else 1.0
-    beside += [up - torch.tensor([0.0, rows]), down + torch.tensor([0.0, rows])]
+    beside += [up - torch.tensor([0.0, step]), down + torch.tensor([0.0, step])]
     return any(float((torch.cdist(side.double(), seen).amin(1) < _LATTICE).double().mean()) > 0.5 for side in beside)
 
 

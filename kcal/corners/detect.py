@@ -222,13 +222,8 @@ def refuse_other_board(views: int, failed: Sequence[tuple[Any, str]], count: int
         found = recognize_images(images, _CHECKED)
         others = found.votes * len(failed) / max(found.looked, 1)
         # A part of the board does not end in one image and have the same size in others.
-        if (
-            found.seen is not None
-            and found.seen.other_than(board)
-            and found.sure
-            and found.votes > 1
-            and others > views
-        ):
+        sure = found.sure and found.votes > 1 and others > views
+        if sure and found.seen is not None and found.seen.other_than(board):
             raise OtherBoardError(
                 f"the board is in {views} of {count} images only; in {found.votes} of {found.looked} others that were "
                 f"looked at another one is seen: give --board {found.seen.text}",

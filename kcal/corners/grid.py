@@ -90,12 +90,8 @@ def sharpness(image: npt.NDArray[np.generic], grid: Tensor) -> float:
     """
     p, q, r, s = grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
     middle = levels_at(image, (p + q + r + s) / 4)
-    near = torch.stack(
-        [
-            levels_at(image, (9 * a + 3 * (b + c) + d) / 16)
-            for a, b, c, d in ((p, q, r, s), (q, p, s, r), (r, s, p, q), (s, r, q, p))
-        ]
-    ).mean(0)
+    turns = ((p, q, r, s), (q, p, s, r), (r, s, p, q), (s, r, q, p))
+    near = torch.stack([levels_at(image, (9 * a + 3 * (b + c) + d) / 16) for a, b, c, d in turns]).mean(0)
     whole = _alternating(middle).nanmedian()
     return float(_alternating(near).nanmedian() / torch.where(whole == 0, 1e-9, whole))
 
@@ -215,13 +211,9 @@ def _steps(lines: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     forth = torch.full_like(lines, float("nan"))
     forth[:, :-1] = lines.diff(dim=1)
     back = -forth.roll(1, 1)
-    step = torch.stack(
-        [
-            torch.where(torch.isnan(back), _beyond(forth, forth.roll(-1, 1)), back),
-            torch.where(torch.isnan(forth), _beyond(back, back.roll(1, 1)), forth),
-        ],
-        2,
-    )
+    whole_back = torch.where(torch.isnan(back), _beyond(forth, forth.roll(-1, 1)), back)
+    whole_forth = torch.where(torch.isnan(forth), _beyond(back, back.roll(1, 1)), forth)
+    step = torch.stack([whole_back, whole_forth], 2)
     outer = torch.zeros(step.shape[:-1], dtype=torch.bool, device=lines.device)
     outer[:, 0, 0] = outer[:, -1, 1] = True
     return step, torch.nan_to_num(_change(step)), outer
@@ -456,10 +448,8 @@ def _bend(grid: Tensor) -> Tensor:
     high, wide = min(3, rows), min(3, columns)
     blocks = grid.unfold(0, high, 1).unfold(1, wide, 1)  # (i, j, 2, high, wide)
     blocks = blocks.reshape(-1, 2, high, wide)
-    side = torch.minimum(
-        torch.linalg.vector_norm(blocks.diff(dim=2), dim=1).amin((1, 2)),
-        torch.linalg.vector_norm(blocks.diff(dim=3), dim=1).amin((1, 2)),
-    )
+    shortest = (torch.linalg.vector_norm(blocks.diff(dim=dim), dim=1).amin((1, 2)) for dim in (2, 3))
+    side = torch.minimum(*shortest)
     flat = blocks.flatten(2).transpose(1, 2)
     center = flat.mean(1, keepdim=True)
     u, v = ((flat - center) / side[:, None, None]).unbind(-1)
@@ -470,7 +460,6 @@ def _bend(grid: Tensor) -> Tensor:
     solution = torch.linalg.lstsq(equations[..., :8], -equations[..., 8:], driver="gelsd").solution[..., 0]
     a = solution[:, None]
     w = a[..., 6] * x + a[..., 7] * y + 1
-    miss = torch.hypot(
-        (a[..., 0] * x + a[..., 1] * y + a[..., 2]) / w - u, (a[..., 3] * x + a[..., 4] * y + a[..., 5]) / w - v
-    )
-    return miss.max()
+    across = (a[..., 0] * x + a[..., 1] * y + a[..., 2]) / w - u
+    down = (a[..., 3] * x + a[..., 4] * y + a[..., 5]) / w - v
+    return torch.hypot(across, down).max()

@@ -425,17 +425,15 @@ def _in_place(seen: Markers, places: Markers, tolerance: float) -> Markers:
     """Those tags that lie where the tags next to them put them."""
     kept = {}
     for number, corners in seen.items():
-        near = sorted(
-            (other for other in seen if other != number),
-            key=lambda other: float(np.linalg.norm(seen[other].mean(0) - corners.mean(0))),
-        )[:_NEIGHBORS]
+        middle = corners.mean(0)
+        away = {other: float(np.linalg.norm(at.mean(0) - middle)) for other, at in seen.items() if other != number}
+        near = sorted(away, key=away.__getitem__)[:_NEIGHBORS]
         own, placed = places[number], np.stack([places[other] for other in near])
         around = np.stack([seen[other] for other in near])
         board_from_image = board_homography(placed.reshape(-1, 2), around.reshape(-1, 2))
         if board_from_image is None:
             continue
-        there = cv2.perspectiveTransform(corners[None], board_from_image)[0]
-        if np.linalg.norm(there - own, axis=1).mean() > tolerance:
+        if _misses(board_from_image, own[None], corners[None])[0] > tolerance:
             continue
         # OpenCV finds tags too small by up to 4 px at each corner; their neighbors correct that.
         both = board_homography(

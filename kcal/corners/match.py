@@ -507,10 +507,8 @@ def refine_point(image: Tensor, pixel: Tensor) -> RefinedPoint:
     if float(room) < 5 * factor:
         raise InputError("the point is within 5 px of the image's border: no room to refine it; mark another point")
     gradient = _gradients(view.patch, _GRADIENT_BLUR * factor)
-    y, x = torch.meshgrid(
-        torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
-    )
-    where = torch.stack([x, y], -1)
+    axes = (torch.arange(side, dtype=torch.float64) for side in (width, height))
+    where = torch.stack(torch.meshgrid(*axes, indexing="xy"), -1)
     scatter = gradient[..., :, None] * gradient[..., None, :]
     place = start
     for _ in range(_MAX_ITERATIONS):

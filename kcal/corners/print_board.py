@@ -224,11 +224,10 @@ def _square_shapes(board: Board) -> PatternShapes:
     ]
     if board.marker is not None:
         side = board.marker * 1000
+        inset = (square - side) / 2
         light = [(r, c) for r in range(board.rows + 1) for c in range(board.columns + 1) if (r + c) % 2 == 1]
         for (row, column), cells in zip(light, marker_cells(board), strict=True):
-            shapes += _marker_shapes(
-                column * square + (square - side) / 2, row * square + (square - side) / 2, side, cells
-            )
+            shapes += _marker_shapes(column * square + inset, row * square + inset, side, cells)
     width, height = (board.columns + 1) * square, (board.rows + 1) * square
     return PatternShapes(width, height, square, (square, square), tuple(shapes))
 
@@ -256,9 +255,8 @@ def _april_shapes(board: Board) -> PatternShapes:
     ]
     for number in range(board.markers):
         row, column = divmod(number, across)  # rows of tags count upward
-        shapes += _marker_shapes(
-            gap + column * pitch, gap + (down - 1 - row) * pitch, side, tag_cells(board.first + number)
-        )
+        cells = tag_cells(board.first + number)
+        shapes += _marker_shapes(gap + column * pitch, gap + (down - 1 - row) * pitch, side, cells)
     return PatternShapes(width, height, gap, (gap, height - gap), tuple(shapes))
 
 

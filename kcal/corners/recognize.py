@@ -213,9 +213,7 @@ def _at_squares(picture: npt.NDArray[np.uint8], tag: npt.NDArray[np.float64]) ->
 
 def _sides(board_from_image: npt.NDArray[np.float64], image: npt.NDArray[np.float64]) -> float:
     """The median side of markers (M, 4, 2), in units of the board."""
-    there = cv2.perspectiveTransform(image.reshape(1, -1, 2), np.asarray(board_from_image, np.float64)).reshape(
-        -1, 4, 2
-    )
+    there = cv2.perspectiveTransform(image.reshape(1, -1, 2), board_from_image).reshape(-1, 4, 2)
     return float(np.median(np.linalg.norm(there - np.roll(there, 1, 1), axis=-1)))
 
 

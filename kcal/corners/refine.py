@@ -206,9 +206,8 @@ def _of_one_image(
         fit = fitted(found.pixels)
         saturated = jagged.status == saddles.CornerStatus.SATURATED
         fit = fit._replace(status=torch.where(saturated, int(saddles.CornerStatus.SATURATED), fit.status))
-        if int((fit.status == saddles.CornerStatus.GOOD).sum()) < int(
-            (jagged.status == saddles.CornerStatus.GOOD).sum()
-        ):
+        before, now = (int((each.status == saddles.CornerStatus.GOOD).sum()) for each in (jagged, fit))
+        if now < before:
             fit, light = jagged, sharp
     assert fit.blur is not None
     if grid is not None and bool((settled[:, 0] & (fit.blur > SECOND_BLUR * side)).any()):

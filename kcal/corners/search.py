@@ -175,14 +175,9 @@ def _are_corners(
     around = torch.nn.functional.pad(known, (2, 2, 2, 2), value=torch.nan)
     near = [around[i : i + known.shape[0], j : j + known.shape[1]] for i in range(5) for j in range(5)]
     typical = torch.stack(near).nanmedian(0).values[new] * grids.checkered(grid)[new]
-    four = torch.stack(
-        [
-            grids.step_along(image, places, along, down),
-            -grids.step_along(image, places, along, -down),
-            grids.step_along(image, places, down, along),
-            -grids.step_along(image, places, down, -along),
-        ]
-    ) / torch.where(typical == 0, torch.nan, typical)
+    ways = ((along, down), (down, along))
+    steps = [sign * grids.step_along(image, places, way, sign * beside) for way, beside in ways for sign in (1, -1)]
+    four = torch.stack(steps) / torch.where(typical == 0, torch.nan, typical)
     return (four.amin(0) > grids.MIN_OUTER * four.amax(0)) & (four.mean(0) > MIN_CONTRAST)
 
 
@@ -444,11 +439,8 @@ def refine_through_sizes(image: Gray, pixels: Tensor, board: Board, factor: floa
     corners 3 px off, too far for full size. Squares too small for refinement are left as they are.
     """
     whole = image.shape[1], image.shape[0]
-    factors = []
-    factor = 4 * factor
-    while factor > 1:
-        factors.append(factor)
-        factor = factor / 2
+    halved = (4 * factor / 2**times for times in itertools.count())
+    factors = list(itertools.takewhile(lambda one: one > 1, halved))
     # Each is reduced from the one twice as large, because reducing the largest image takes the time.
     steps, source = [], image
     for factor in reversed(factors):

@@ -190,12 +190,8 @@ def read_mrcal(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
             lost = ["error bars are those of the corners in the file; the corners themselves are not kept"]
         except NoInformationError as reason:
             lost = [f"no error bars: {reason}"]
-    return foreign.ImportedCameras(
-        format="mrcal",
-        cameras=(camera,),
-        poses=(foreign.checked_pose(foreign.plain(rotation), [x, y, z]),),
-        notes=tuple(lost),
-    )
+    pose = foreign.checked_pose(foreign.plain(rotation), [x, y, z])
+    return foreign.ImportedCameras(format="mrcal", cameras=(camera,), poses=(pose,), notes=tuple(lost))
 
 
 def write_mrcal(cameras: Sequence[Camera], poses: Sequence[Pose], path: Path) -> list[Path]:

@@ -146,6 +146,7 @@ COLMAP_MODELS = {
     # Known, so that other cameras of a binary file can be read; a panorama is no camera of kcal.
     "EQUIRECTANGULAR": ColmapModel(17, ("w", "h"), ""),
 }
+_BY_NUMBER = {known.number: name for name, known in COLMAP_MODELS.items()}
 WRITTEN = {"pinhole": "PINHOLE", "opencv4": "OPENCV", "opencv8": "FULL_OPENCV", "fisheye4": "OPENCV_FISHEYE",
            "fov": "FOV", "division": "DIVISION", "eucm": "EUCM",
            "rad-tan-thin-prism": "RAD_TAN_THIN_PRISM_FISHEYE"}  # fmt: skip
@@ -191,7 +192,6 @@ def read_colmap(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
 
 
 def _from_database(path: Path, notes: list[str]) -> tuple[Entries, Rigs]:
-    by_number = {known.number: name for name, known in COLMAP_MODELS.items()}
     with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as base:
         base.execute("PRAGMA trusted_schema = OFF")
         # A view may compute forever.
@@ -210,7 +210,7 @@ def _from_database(path: Path, notes: list[str]) -> tuple[Entries, Rigs]:
     entries, rigs = Entries(), {rig: dict[int, Sequence[float]]({sensor: _STILL}) for rig, sensor in first}
     for number, kind, width, height, data, known in cameras:
         values = list(struct.unpack(f"<{len(data) // 8}d", data))
-        entries.append((number, by_number.get(kind, f"number {kind}"), foreign.whole_size(width, height), values))
+        entries.append((number, _BY_NUMBER.get(kind, f"number {kind}"), foreign.whole_size(width, height), values))
         if not known:
             notes.append(f"camera {number}: prior_focal_length is 0, so its focal length is a guess of COLMAP")
     for rig, sensor, move in (one for one in moves if one[2]):
@@ -281,14 +281,13 @@ def _from_text(path: Path) -> Entries:
 
 
 def _from_binary(data: bytes) -> Entries:
-    by_number = {known.number: name for name, known in COLMAP_MODELS.items()}
     try:
         (count,), place, entries = struct.unpack_from("<Q", data), 8, []
         for _ in range(count):
             number, kind, width, height = struct.unpack_from("<IiQQ", data, place)
-            if kind not in by_number:
+            if kind not in _BY_NUMBER:
                 raise ValueError(f"camera {number} has the model number {kind}, which kcal does not read")
-            name = by_number[kind]
+            name = _BY_NUMBER[kind]
             size = len(COLMAP_MODELS[name].parameters)
             values = list(struct.unpack_from(f"<{size}d", data, place + 24))
             place += 24 + 8 * size
@@ -379,10 +378,8 @@ def _nerfstudio_camera(values: dict[str, Any], name: str, hints: foreign.Hints) 
     fisheye = kind in ("OPENCV_FISHEYE", "fisheye") or values.get("is_fisheye") in (True, 1)
     if kind not in (*_PERSPECTIVE, "OPENCV_FISHEYE", "fisheye"):
         raise ValueError(f"camera_model {kind}: kcal reads {', '.join(_PERSPECTIVE)} and OPENCV_FISHEYE")
-    if "w" in values and "h" in values:
-        size = foreign.whole_size(values["w"], values["h"])
-    else:
-        size = foreign.known_size(hints.size)
+    stated_size = foreign.whole_size(values["w"], values["h"]) if {"w", "h"} <= values.keys() else hints.size
+    size = foreign.known_size(stated_size)
     given = {key: foreign.numbers(value, 1, key)[0] for key, value in values.items() if key in _NUMBERS}
     if "distortion_params" in values:
         stated = foreign.numbers(values["distortion_params"], 6, "distortion_params")

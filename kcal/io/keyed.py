@@ -319,9 +319,8 @@ def _camera(
     key = named.key("lens", side) if stated is not None else "the coefficients k1, k2, p1, p2"
     named.agrees(order, lens, side, key)
     if isinstance(fisheye, str):
-        return _realsense_lens(
-            fisheye, foreign.named_camera(name, core, size, "pinhole"), foreign.numbers(lens, 5, key), notes
-        )
+        plain = foreign.named_camera(name, core, size, "pinhole")
+        return _realsense_lens(fisheye, plain, foreign.numbers(lens, 5, key), notes)
     if fisheye and len(lens) > 4 and not any(lens[4:]):
         lens = lens[:4]
     if xi:
@@ -400,9 +399,8 @@ def _delivered(named: _Named, side: str, camera: Camera, notes: list[str]) -> Ca
         notes.append(
             f"the principal point ({cx:g}, {cy:g}) is in the middle of {images}: taken as that of these images"
         )
-        return foreign.named_camera(
-            foreign.camera_name(camera, ""), (fx, fy, cx, cy), (wide, high), camera.model, lens, skew
-        )
+        name = foreign.camera_name(camera, "")
+        return foreign.named_camera(name, (fx, fy, cx, cy), (wide, high), camera.model, lens, skew)
     notes.append(f"the camera is that of {images}")
     cut = camera.cropped(left, top, (wide * bins[0], high * bins[1]))
     return cut.transformed(ImageTransform.resize(cut.size, (wide, high)))

@@ -159,9 +159,8 @@ class ImageTransform:
         """Camera parameters (..., 5 + P) of the full image to those of the input; only the intrinsics change."""
         moved = (parameters[..., 2:4] + 0.5) * parameters.new_tensor(self.scale) + parameters.new_tensor(self.offset)
         factors = self.factors(parameters)
-        return torch.cat(
-            [parameters[..., :2] * factors[:2], moved - 0.5, parameters[..., 4:] * factors[4:]], -1
-        )  # fmt: skip
+        parts = [parameters[..., :2] * factors[:2], moved - 0.5, parameters[..., 4:] * factors[4:]]
+        return torch.cat(parts, -1)
 
     def factors(self, parameters: Tensor) -> Tensor:
         """(5 + P,) by which errors of camera parameters (..., 5 + P) grow; skew is one of columns."""
@@ -188,9 +187,7 @@ class ImageTransform:
 # Cameras made from a camera: of resized, cropped and letterboxed images, of OpenCV and of kornia.
 
 # The lens model that has so many of OpenCV's coefficients.
-OPENCV_MODELS = {
-    0: "pinhole", 4: "opencv4", 5: "opencv5", 8: "opencv8", 12: "opencv12", 14: "opencv14",
-}  # fmt: skip
+OPENCV_MODELS = {0: "pinhole"} | {count: f"opencv{count}" for count in (4, 5, 8, 12, 14)}
 
 
 class ConvertibleCamera(CameraParameters):

@@ -253,9 +253,8 @@ def project_stack(stack: CameraStack, points: Tensor, wanted: Sequence[Sequence[
     ]
     rates = None
     if any(one.by_meter is not None for one in each):
-        rates = torch.stack(
-            [torch.zeros_like(one.pixels) if one.by_meter is None else one.by_meter for one in each], -3
-        )
+        moved = [torch.zeros_like(one.pixels) if one.by_meter is None else one.by_meter for one in each]
+        rates = torch.stack(moved, -3)
     columns = zip(*(one[:4] for one in each), strict=True)
     pixels, by_point, by_camera, regular = map(torch.stack, columns, _CAMERAS)
     return Projection(pixels, by_point, by_camera, regular, rates)
@@ -396,11 +395,7 @@ class CameraRays(Float64Module):
                 raise InputError("viewmats: the left part of a matrix is no rotation; scales belong into the scene")
             turn, shift = rotation[..., None, None, :, :], translation[..., None, None, :]
             # Row vectors times R are Rᵀ v: from the camera to the world.
-            moved = (
-                ((origins - shift)[..., None, :] @ turn)[..., 0, :],
-                (directions[..., None, :] @ turn)[..., 0, :],
-            )
-            rays = torch.cat(moved, -1)
+            rays = torch.cat([(part[..., None, :] @ turn)[..., 0, :] for part in (origins - shift, directions)], -1)
         return torch.where(mask[..., None], rays, 0.0).to(dtype)
 
 

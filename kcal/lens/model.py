@@ -551,14 +551,12 @@ def distort_components(
         m10, m11 = -sin_y * (sin_x + y_tilted) * scale, cos_y * (1.0 + sin_x * y_tilted) * scale
         a, b, d, e = point
         point = (m00 * a + m01 * d, m00 * b + m01 * e, m10 * a + m11 * d, m10 * b + m11 * e)
-    by_angle = (
-        {
+    by_angle: dict[str, tuple[Tensor, ...]] = {}
+    if wanted:
+        by_angle = {
             "tau_x": (-sin_x * u, -cos_x * sin_y * u, -cos_y * (cos_x * v + sin_x)),
             "tau_y": (torch.zeros_like(u), -sin_x * cos_y * u - sin_y * v, cos_y * u + sin_y * (sin_x * v - cos_x)),
         }
-        if wanted
-        else {}
-    )
     tilted = []
     for index, pair in zip(wanted, columns, strict=True):
         if pair is None:

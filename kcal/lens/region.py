@@ -232,10 +232,7 @@ def _proven_part(coefficients: Tensor, model: LensModel, limits: Tensor, region:
     blocks = single.unflatten(-1, (DIRECTIONS, -1)).amin(-1)
     within = torch.minimum(limits, _INSIDE * torch.minimum(blocks, blocks.roll(1, -1)))
     shrunk = sampled_region(coefficients, model, within, single)
-    cuts = [
-        _narrow_cuts(own, reach)
-        for own, reach in zip(single.reshape(-1, SECTORS), region.sector_reach().reshape(-1, SECTORS), strict=True)
-    ]
+    cuts = list(map(_narrow_cuts, single.reshape(-1, SECTORS), region.sector_reach().reshape(-1, SECTORS)))
     count = max(0 if own is None else len(own) for own in cuts)
     none = single.new_tensor([0.0, 0.0, 1.0, math.inf])
     padded = [
@@ -445,9 +442,8 @@ class Span:
             total = torch.full_like(self.half, 0.0 if order else constant)
             for weight, power in zip(weights, powers, strict=True):
                 if power >= order:
-                    total = torch.addcmul(
-                        total, weight, self._power(which, power - order), value=math.perm(power, order)
-                    )
+                    rest = self._power(which, power - order)
+                    total = torch.addcmul(total, weight, rest, value=math.perm(power, order))
             return total
 
         bend = derivative(2, 0, coefficients).abs() + self.half * derivative(3, 1, magnitudes)

@@ -313,9 +313,8 @@ def square_root_information(camera: Camera, order: Sequence[int]) -> tuple[Tenso
     if known is None:
         return None
     lens = known.without_board()
-    slopes, _, good = pixel_slopes(
-        camera, camera.grid(17, 13).reshape(-1, 2), torch.inf, list(range(len(camera.names)))
-    )
+    every = list(range(len(camera.names)))
+    slopes, _, good = pixel_slopes(camera, camera.grid(17, 13).reshape(-1, 2), torch.inf, every)
     stiff = slopes[good].abs().flatten(0, 1).amax(0).clamp_min(_ROUNDING) / _HELD_PX
     # Each unknown is the mean of the parameters that share it; these are equal.
     share = lens.selection()
@@ -327,7 +326,7 @@ def square_root_information(camera: Camera, order: Sequence[int]) -> tuple[Tenso
         stiff[:, None] * (torch.diag(1.0 * ~held) - share @ mean),
     ]
     # Columns of what is not asked for first: below their triangle, rows say nothing of them.
-    others = [index for index in range(len(camera.names)) if index not in order]
+    others = [index for index in every if index not in order]
     triangle = triangular(torch.cat(rows)[:, [*others, *order]])[len(others) :, len(others) :]
     upright = torch.where(triangle.diagonal() < 0, -1.0, 1.0)
     return upright[:, None] * triangle, tuple(name for name, fixed in zip(camera.names, held, strict=True) if fixed)

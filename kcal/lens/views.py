@@ -358,9 +358,8 @@ def pinhole_view(field_of_view: float, size: tuple[int, int]) -> Camera:
     if min(size) < 2:
         raise InputError(f"a view of {width}x{height} px: at least 2 pixels each way are needed")
     focal = 0.5 * (width - 1) / math.tan(math.radians(0.5 * field_of_view))
-    return Camera.build(
-        focal=(focal, focal), center=(0.5 * (width - 1), 0.5 * (height - 1)), size=size, model="pinhole"
-    )
+    center = (0.5 * (width - 1), 0.5 * (height - 1))
+    return Camera.build(focal=(focal, focal), center=center, size=size, model="pinhole")
 
 
 def cylinder_view(camera: Camera, field_of_view: float | None = None, size: tuple[int, int] | None = None) -> Cylinder:

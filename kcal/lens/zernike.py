@@ -106,14 +106,12 @@ class ZernikeProducts(NamedTuple):
 
     def columns(self, x: Tensor, y: Tensor, scale: Tensor | None = None, out: Tensor | None = None) -> Tensor:
         """(M, ..., 2, N) as `FieldModes.columns`, times a scale (..., 2, N), into memory if it is given."""
-        profiles = (self.profiles @ self.polynomials(x.reshape(-1), y.reshape(-1))).unflatten(
-            -1, (*x.shape[:-1], 1, x.shape[-1])
-        )
+        profiles = self.profiles @ self.polynomials(x.reshape(-1), y.reshape(-1))
+        profiles = profiles.unflatten(-1, (*x.shape[:-1], 1, x.shape[-1]))
         re, im = self.powers(x, y).movedim((-3, -2), (0, 1))
         # A mode has one of four pairs of u and v.
-        pairs = (
-            torch.stack([re, im, -im, re, re, -im, im, re]).unflatten(0, (4, 2)).movedim((2, 1), (1, -2)).flatten(0, 1)
-        )
+        pairs = torch.stack([re, im, -im, re, re, -im, im, re]).unflatten(0, (4, 2))
+        pairs = pairs.movedim((2, 1), (1, -2)).flatten(0, 1)
         if scale is not None:
             pairs = pairs * scale
         # Rows at a time: these tables are large, and bound by memory.
@@ -406,10 +404,8 @@ def _times_plus(value: _Complex, z: _Complex, added: _Complex, reuse: bool) -> _
     (a, b), (x, y), (p, q) = value, z, added
     if reuse and p.shape == q.shape == x.shape and all(part.ndim == 0 or part.shape == x.shape for part in (a, b)):
         return p.addcmul_(a, x).addcmul_(b, y, value=-1.0), q.addcmul_(b, x).addcmul_(a, y)
-    return (
-        torch.addcmul(torch.addcmul(p, a, x), b, y, value=-1.0),
-        torch.addcmul(torch.addcmul(q, b, x), a, y),
-    )
+    real = torch.addcmul(torch.addcmul(p, a, x), b, y, value=-1.0)
+    return real, torch.addcmul(torch.addcmul(q, b, x), a, y)
 
 
 @functools.cache
