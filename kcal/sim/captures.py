@@ -97,8 +97,7 @@ def sample_board_poses(
     focal = camera.focal.detach()
     unit = max(float(focal[0]) * extent[0] / width, float(focal[1]) * extent[1] / height)
     drawn = draw_poses(camera, board, (unit / fill[1], unit / fill[0]), None, generator, options)
-    still = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    return choose_poses(drawn, [(camera, *still)], board, count, options)
+    return choose_poses(drawn, [(camera, *Pose.still())], board, count, options)
 
 
 def check_draws(count: int, name: str, limits: tuple[float, float]) -> None:
@@ -425,12 +424,8 @@ def board_points(board: BoardLike, border: int = 0) -> Tensor:
         torch.Size([20, 3])
     """
     check_board(board)
-    y, x = torch.meshgrid(
-        torch.arange(-border, board.rows + border, dtype=torch.float64),
-        torch.arange(-border, board.columns + border, dtype=torch.float64),
-        indexing="ij",
-    )
-    return torch.stack([x.reshape(-1), y.reshape(-1), torch.zeros(x.numel(), dtype=torch.float64)], -1) * board.square
+    y, x = (torch.arange(-border, count + border, dtype=torch.float64) for count in (board.rows, board.columns))
+    return torch.nn.functional.pad(torch.cartesian_prod(y, x).flip(-1), (0, 1)) * board.square
 
 
 def true_corners(board: BoardLike) -> Tensor:

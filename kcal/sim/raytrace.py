@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -115,15 +116,9 @@ class Prescription:
     @property
     def elements(self) -> tuple[tuple[int, int], ...]:
         """First and last surface of each piece of glass; cemented lenses are one piece."""
-        pieces: list[tuple[int, int]] = []
-        first = None
-        for i, surface in enumerate(self.surfaces):
-            if first is None and surface.index != 1.0:
-                first = i
-            elif first is not None and surface.index == 1.0:
-                pieces.append((first, i))
-                first = None
-        return tuple(pieces)
+        glass = [False, *(surface.index != 1.0 for surface in self.surfaces)]
+        between = [i for i, (before, behind) in enumerate(itertools.pairwise(glass)) if before != behind]
+        return tuple(zip(between[::2], between[1::2], strict=False))
 
 
 def system_matrix(prescription: Prescription) -> tuple[float, float, float, float]:

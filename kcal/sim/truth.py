@@ -42,11 +42,6 @@ def grow(window: PixelRectangle, by: int) -> PixelRectangle:
 # Tabulate smooth functions of a pixel as sums of Chebyshev polynomials, exact to rounding, with derivatives.
 
 
-def nodes(degree: int) -> Tensor:
-    """(degree + 1,) Chebyshev points of the first kind on [-1, 1]."""
-    return torch.cos(math.pi * (torch.arange(degree + 1, dtype=torch.float64) + 0.5) / (degree + 1))
-
-
 @dataclass(frozen=True, eq=False)
 class ChebyshevTable:
     """K functions on a rectangle of pixels; see `tabulate`.
@@ -96,14 +91,15 @@ def tabulate(function: Callable[[Tensor], Tensor], window: PixelRectangle, degre
         >>> [round(value, 9) for value in table.values(torch.tensor([[50.0, 20.0]]).double())[0].tolist()]
         [1.648721271, 1.221402758]
     """
-    t = nodes(degree)
+    order = torch.arange(degree + 1, dtype=torch.float64)
+    # Chebyshev points of the first kind are the cosines of these.
+    angles = math.pi * (order + 0.5) / (degree + 1)
+    t = torch.cos(angles)
     x = window.left + 0.5 * (window.width - 1) * (t + 1)
     y = window.top + 0.5 * (window.height - 1) * (t + 1)
     grid = torch.stack(torch.meshgrid(x, y, indexing="ij"), -1)
     sampled = function(grid.reshape(-1, 2)).unflatten(0, grid.shape[:2])
-    order = torch.arange(degree + 1, dtype=torch.float64)
     # The discrete cosine transform: T_j at node i is cos(j θ_i).
-    angles = math.pi * (order + 0.5) / (degree + 1)
     transform = torch.cos(order[:, None] * angles) * (2.0 / (degree + 1))
     transform[0] *= 0.5
     coefficients = torch.einsum("ai,ijk,bj->akb", transform, sampled, transform)
@@ -312,10 +308,10 @@ class TruthLens:
         axis = center or ((size[0] - 1) / 2, (size[1] - 1) / 2)
         glass = misalignment or Misalignment()
         self._chief = ChiefRays(prescription, self._focal, focal_mm, axis, glass, sensor_tilt)
-        self._origin = self._chief.lines(self._probe(17)).nearest_point()
-        self._window = PixelRectangle(
-            -_TABLE_MARGIN, -_TABLE_MARGIN, self.size[0] + 2 * _TABLE_MARGIN, self.size[1] + 2 * _TABLE_MARGIN
-        )
+        probed = (torch.linspace(0, extent - 1, 17, dtype=torch.float64) for extent in self.size)
+        pixels = torch.stack(torch.meshgrid(*probed, indexing="xy"), -1).reshape(-1, 2)
+        self._origin = self._chief.lines(pixels).nearest_point()
+        self._window = grow(PixelRectangle(0, 0, *self.size), _TABLE_MARGIN)
         low = torch.tensor([self._window.left, self._window.top], dtype=torch.float64)
         extent = torch.tensor([self._window.width - 1, self._window.height - 1], dtype=torch.float64)
         self.low, self.high = low, low + extent
@@ -395,11 +391,6 @@ class TruthLens:
         # Newton's method stops at the edge of the table for points that the lens does not see.
         valid = ahead & (error.abs().amax(-1) * self._focal < _PROJECT_ERROR)
         return torch.where(valid[:, None], pixels, self._chief.axis), valid
-
-    def _probe(self, count: int) -> Tensor:
-        x = torch.linspace(0, self.size[0] - 1, count, dtype=torch.float64)
-        y = torch.linspace(0, self.size[1] - 1, count, dtype=torch.float64)
-        return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
 
     def _measure(self) -> float:
         share = torch.quasirandom.SobolEngine(2).draw(256, dtype=torch.float64)

@@ -281,36 +281,38 @@ def attach_implicit_gradient(
 # Dense least squares for any residual function, batched, with Jacobians from `torch.func`.
 
 
-class DenseLinearization:
+class BatchLinearization:
+    """Base of linearizations whose attributes are all tensors that begin with the batch."""
+
+    cost: Tensor
+
+    def blend(self, mask: Tensor, other: Self) -> Self:
+        """See `Linearization.blend`."""
+        out = copy.copy(self)
+        old, new = (tuple(vars(one)[name] for name in vars(self)) for one in (self, other))
+        vars(out).update(zip(vars(self), blend(mask, old, new), strict=True))
+        return out
+
+
+class DenseLinearization(BatchLinearization):
     """Normal equations of one dense Jacobian (..., R, P), columns scaled to length one."""
 
     def __init__(self, residuals: Tensor, jacobian: Tensor) -> None:
         norm = torch.linalg.vector_norm(jacobian, dim=-2)
         # A zero column belongs to a parameter without effect, which never moves.
-        scale = torch.where(norm > 0, 1.0 / norm, 1.0)
-        scaled = jacobian * scale[..., None, :]
-        normal, gradient = scaled.transpose(-1, -2) @ scaled, (scaled * residuals[..., None]).sum(-2)
-        self._parts = 0.5 * (residuals * residuals).sum(-1), scale, normal, gradient
-
-    @property
-    def cost(self) -> Tensor:
-        """See `Linearization`."""
-        return self._parts[0]
-
-    def blend(self, mask: Tensor, other: DenseLinearization) -> DenseLinearization:
-        """See `Linearization.blend`."""
-        out = copy.copy(self)
-        out._parts = blend(mask, self._parts, other._parts)
-        return out
+        self._scale = torch.where(norm > 0, 1.0 / norm, 1.0)
+        scaled = jacobian * self._scale[..., None, :]
+        self._normal, self._gradient = scaled.transpose(-1, -2) @ scaled, (scaled * residuals[..., None]).sum(-2)
+        self.cost = 0.5 * (residuals * residuals).sum(-1)
 
     def step(self, damping: Tensor) -> tuple[State, Tensor]:
         """See `Linearization.step`."""
-        _, scale, normal, gradient = self._parts
+        normal, gradient = self._normal, self._gradient
         identity = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
         factor, info = torch.linalg.cholesky_ex(normal + damping[..., None, None] * identity)
         delta = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
         predicted = 0.5 * (damping * (delta * delta).sum(-1) - (gradient * delta).sum(-1))
-        return (delta * scale,), torch.where(info == 0, predicted, torch.nan)
+        return (delta * self._scale,), torch.where(info == 0, predicted, torch.nan)
 
 
 class DenseProblem:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal.solve.lm import S, State, blend
+from kcal.solve.lm import BatchLinearization, S, State
 
 # Least squares with many small local blocks that are coupled only through shared parameters.
 #
@@ -79,7 +79,7 @@ class Products(NamedTuple):
         )
 
 
-class SchurLinearization:
+class SchurLinearization(BatchLinearization):
     """Normal equations, built from one block per view.
 
     Args:
@@ -123,14 +123,6 @@ class SchurLinearization:
         out._shared_gradient = shared * self._shared_scale
         (by_shared, by_local), _ = out.step(torch.zeros_like(self.cost) if damping is None else damping)
         return -by_shared, -by_local
-
-    def blend(self, mask: Tensor, other: SchurLinearization) -> SchurLinearization:
-        """See `Linearization.blend`."""
-        out = copy.copy(self)
-        names = tuple(vars(self))
-        old, new = (tuple(vars(one)[name] for name in names) for one in (self, other))
-        vars(out).update(zip(names, blend(mask, old, new), strict=True))
-        return out
 
     def _reduce(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Eliminate the local blocks: reduced matrix, reduced gradient, roots R of the blocks, R⁻¹[B, g], failures."""

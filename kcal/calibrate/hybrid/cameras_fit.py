@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, cast
@@ -260,7 +261,7 @@ def grouped(cameras: Sequence[CameraFit], kinds: Sequence[Board]) -> list[Camera
             groups.append(_SharedBoard([i], out[i].message, together))
         else:
             home.members.append(i)
-            home.said, home.evidence = _merged([home.said, out[i].message]), together
+            home.said, home.evidence = stacked([home.said, out[i].message]).compressed(), together
     # Boards are numbered by their first cameras.
     for k, group in enumerate(sorted(groups, key=lambda group: min(group.members))):
         but_one = _but_one([out[i].message for i in group.members])
@@ -304,21 +305,15 @@ def others_of(cameras: Sequence[CameraFit], board: int) -> dict[int, Gaussian | 
 
 def _but_one(messages: Sequence[Gaussian]) -> list[Gaussian | None]:
     """For each message, all others merged; None where there is no other. The work is linear in the messages."""
-
-    def running(messages: Sequence[Gaussian]) -> list[Gaussian | None]:
-        out: list[Gaussian | None] = [None]
-        for message in messages[:-1]:
-            out.append(_merged([m for m in (out[-1], message) if m is not None]))
-        return out
-
-    before, after = running(messages), running(messages[::-1])[::-1]
-    both = [[m for m in pair if m is not None] for pair in zip(before, after, strict=True)]
-    return [_merged(some) if some else None for some in both]
+    before = itertools.accumulate([None, *messages[:-1]], _merged)
+    after = [*itertools.accumulate([None, *messages[:0:-1]], _merged)]
+    return [*map(_merged, before, reversed(after))]
 
 
-def _merged(messages: Sequence[Gaussian]) -> Gaussian:
-    """The sum of the messages, in as many rows as there are unknowns."""
-    return stacked(messages).compressed()
+def _merged(*messages: Gaussian | None) -> Gaussian | None:
+    """The sum of those messages that there are, in as many rows as there are unknowns; None without any."""
+    some = [message for message in messages if message is not None]
+    return stacked(some).compressed() if some else None
 
 
 def _evidence(messages: Sequence[Gaussian], like: CameraFit) -> float:

@@ -273,7 +273,7 @@ def negative_log_evidence(
     found = _posterior(data, families, v[:-1], v[-1])
     if found is None:
         return math.inf, np.zeros_like(v), np.zeros((len(v), len(v)))
-    return found.value, found.slope, found.bend
+    return found.best.value, found.slope, found.bend
 
 
 class _Best(NamedTuple):
@@ -291,7 +291,6 @@ class _Posterior(NamedTuple):
     """-ln p, its first and second derivatives by h and ln σ², and what those by motions need.
 
     Attributes:
-        value: -ln p.
         slope: (H + 1,).
         bend: (H + 1, H + 1).
         best: lens and board.
@@ -299,7 +298,6 @@ class _Posterior(NamedTuple):
         by_h: (S, H) derivatives of 2 ln (prior standard deviation) by h.
     """
 
-    value: float
     slope: np.ndarray
     bend: np.ndarray
     best: _Best
@@ -343,7 +341,7 @@ def _posterior(data: Quadratic, families: PriorFamilies, h: np.ndarray, log_vari
     noise = 0.5 * (data.freedom - (len(y) - float(kept.sum())) - rss * s2)
     by_noise = 0.5 * (float(kept.sum()) - float(squared.sum()) + rss * s2) - float(y @ My)
     whole = np.block([[by_h.T @ bend @ by_h + np.diag(by_a @ again), across[:, None]], [across, by_noise]])
-    return _Posterior(best.value, np.append(slope, noise), whole, best, covariance, by_h)
+    return _Posterior(np.append(slope, noise), whole, best, covariance, by_h)
 
 
 # The logarithms of motions' standard deviations over the noise, of views that stand still.
@@ -498,7 +496,7 @@ class EvidenceLoss:
         each[:, count:-1], each[:, -1] = np.diag(1.0 / spread), 0.5 / spread
         slope[:count] += z / self._sd
         bend[np.diag_indices(count)] += self._sd**-2.0
-        value = found.value + self._beside(v, integrated.log_determinant)
+        value = found.best.value + self._beside(v, integrated.log_determinant)
         return value, slope + w @ each, bend + each.T @ each
 
     def _parts(self, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:

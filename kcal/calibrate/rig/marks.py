@@ -74,10 +74,6 @@ class Landmarks(MarkSource):
         if not bool((torch.isfinite(self.sigma) & (self.sigma > 0)).all()):
             raise InputError("landmarks: every sigma must be a positive number of meters; nothing is surveyed exactly")
 
-    def by_mark(self) -> Landmarks:
-        """See `MarkSource.by_mark`."""
-        return dataclasses.replace(self, pixel_sigma=self.each_sigma)
-
     def enough(self, cameras: Sequence[Camera]) -> Tensor:
         """See `ItemSource.enough`."""
         return self.marked.any(-1)
@@ -128,7 +124,6 @@ _UP = 2
 class LandmarkBlock(MarkBlock):
     """Surveyed points, whose adjusted positions (V, 3), meters, are the unknowns; the third axis is up."""
 
-    kind = "landmarks"
     size = 3
     surveyed: ClassVar[bool] = True
 
@@ -258,7 +253,6 @@ def inverse_range_beyond(meters: float) -> tuple[float, float]:
 class FeatureBlock(MarkBlock):
     """Points of unknown position: a unit vector (V, 3) and an inverse range (V, 1), 1/m, from the anchor each."""
 
-    kind = "features"
     size = 3
     by_rows: ClassVar[bool] = True
 
@@ -398,10 +392,6 @@ class StarSource(MarkSource):
         direction = torch.where(self.named[:, None], self.direction, seen)
         return as_items(direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True))
 
-    def by_mark(self) -> StarSource:
-        """See `MarkSource.by_mark`."""
-        return self
-
     def block(self, mask: Tensor, given: Context) -> Block:
         """See `ItemSource.block`."""
         return StarBlock(self, mask, given)
@@ -418,7 +408,6 @@ class StarBlock(MarkBlock):
     which are standard normal beforehand.
     """
 
-    kind = "stars"
     size = 2
 
     def __init__(self, source: StarSource, mask: Tensor, given: Context) -> None:

@@ -304,7 +304,6 @@ def records(work: Adjustment, mask: Tensor, reasons: Reasons) -> Records:
         mask: the items that take part.
         reasons: why others could not take part, where that is known.
     """
-    items = list[ItemResidual]()
     telling = [source.marked.flatten(1).sum(-1) >= source.told_by for source, _ in work.sources]
     outside = ~mask & all_of(telling, mask[:0])
     if bool(outside.any()):
@@ -312,7 +311,7 @@ def records(work: Adjustment, mask: Tensor, reasons: Reasons) -> Records:
     square, freedom = work.squares(mask), work.freedom(mask)
     squared, count = work.squares_px(mask, work.state)
     over = work.over_limit(mask, work.deletions(mask))
-    items += _item_records(work, mask, (square, freedom, squared, count, over), reasons, used=True)
+    items = _item_records(work, mask, (square, freedom, squared, count, over), reasons, used=True)
     if bool(outside.any()):
         gone = work.squares(outside)
         fit = gone, work.freedom(outside), *work.squares_px(outside, work.at_survey(work.state))

@@ -380,9 +380,9 @@ class MarkSource(ItemSource):
         # Where a mark is missing, its covariance may be anything.
         return torch.linalg.inv(torch.linalg.cholesky_ex(self.covariance.nan_to_num(1.0))[0]) / times
 
-    @abstractmethod
     def by_mark(self) -> Self:
         """The same with the uncertainty of each mark, which two of a kind may be joined with."""
+        return dataclasses.replace(self, pixel_sigma=self.each_sigma)  # type: ignore[type-var]
 
     def __add__(self, other: Self) -> Self:
         """Both; effects shift only those whose they are."""
@@ -452,10 +452,10 @@ class Block(ABC):
     squares add up to χ².
 
     Args:
+        kind: of the source.
         pixels: (V, C, N, 2), NaN where not seen.
 
     Attributes:
-        kind: of the source.
         size: unknowns of each item, at most 6.
         by_rows: whether each item's own unknowns are eliminated from its rows by QR, because they may be hardly
             determined; otherwise by products.
@@ -463,14 +463,13 @@ class Block(ABC):
         surveyed: whether it is known where the items are, so that three of them place a camera.
     """
 
-    kind: str
     size: int
     by_rows: ClassVar[bool] = False
     many: ClassVar[bool] = False
     surveyed: ClassVar[bool] = False
 
-    def __init__(self, pixels: Tensor) -> None:
-        self.pixels, self.seen = pixels, torch.isfinite(pixels).all(-1)
+    def __init__(self, kind: str, pixels: Tensor) -> None:
+        self.kind, self.pixels, self.seen = kind, pixels, torch.isfinite(pixels).all(-1)
         self._used = self.seen.any(-1).any(0).tolist()
 
     def __len__(self) -> int:
@@ -548,7 +547,7 @@ class MarkBlock(Block):
 
     def __init__(self, source: MarkSource, mask: Tensor, given: Context, priors: Tensor | int) -> None:
         pixels = source.pixels[mask]
-        super().__init__(pixels[:, :, None])
+        super().__init__(source.kind, pixels[:, :, None])
         self._effects, self._priors = given.effects and given.effects.some(mask), priors
         self._target = torch.where(self.seen, pixels, 0.0)[..., None]
         self._whitening = torch.where(self.seen[..., None], source.whitening(given.times)[mask], 0.0)[..., None]

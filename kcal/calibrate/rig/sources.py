@@ -202,13 +202,12 @@ class BoardBlock(Block):
     the camera in the world.
     """
 
-    kind = "boards"
     size = 6
     many: ClassVar[bool] = True
 
     def __init__(self, source: Boards, mask: Tensor, given: Context) -> None:
         pixels, points, unknowns = source.pixels[mask], source.points, given.unknowns
-        super().__init__(pixels)
+        super().__init__(source.kind, pixels)
         self._unknowns, flat = unknowns, points.new_zeros(0, *points.T.shape)
         weights = source.whitening(given.sigma_corner)[mask]
         # What each camera sees, and what takes motions out of its rows; nothing for cameras that see no board.
