@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -346,12 +346,24 @@ def calibrate_by_stars(
         return fit_star_lens(fields, turns, size, float(camera.params[0])), None, seen
 
     if boards is None:
-        camera, rotations = _first_lens(images, order, _plain_cameras(size, focal), catalog, progress)
-        # Stars get names from the middle outward while the lens becomes better known.
-        for share in (0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.2) if camera.model.fisheye else (0.6, 0.8, 1.0, 1.2):
-            lens, _, seen = fitted(camera, rotations, share)
-            camera = lens.camera
-            rotations = {n: found.numpy() for n, found in zip(seen, lens.rotations, strict=True)}
+        failure: InputError | None = None
+        for camera, rotations in _first_lenses(images, order, _plain_cameras(size, focal), catalog, progress):
+            try:
+                # Stars get names from the middle outward while the lens becomes better known.
+                for share in (0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.2) if camera.model.fisheye else (0.6, 0.8, 1.0, 1.2):
+                    lens, _, seen = fitted(camera, rotations, share)
+                    camera = lens.camera
+                    rotations = {n: found.numpy() for n, found in zip(seen, lens.rotations, strict=True)}
+                break
+            except InputError as error:
+                # Another lens may explain a few stars in the middle.
+                failure = error
+        else:
+            raise failure or InputError(
+                f"in none of {len(images)} images stars have names: too few are seen, this is not the night sky, or "
+                f"its diagonal field of view is not {_NARROWEST:g} to {_WIDEST:g} degrees: start from a camera file "
+                "(--camera)"
+            )
     else:
         camera = boards.camera
         if camera.size != size:
@@ -385,14 +397,14 @@ def calibrate_by_stars(
     )
 
 
-def _first_lens(
+def _first_lenses(
     images: Sequence[DetectedStars],
     order: Sequence[int],
     cameras: Sequence[Camera],
     catalog: StarCatalog,
     progress: Callable[[str], object],
-) -> tuple[Camera, dict[int, np.ndarray]]:
-    """A rough camera from the first image whose stars have names, and its rotation."""
+) -> Iterator[tuple[Camera, dict[int, np.ndarray]]]:
+    """Rough cameras, each from an image whose stars have names, and its rotation."""
     # More triangles take five times as long: of one image, where few have failed in all.
     tries = [(_FEW_CORNERS, number) for number in order[:_TRIES]] + [(_MORE_CORNERS, number) for number in order[:1]]
     for count, (corners, number) in enumerate(tries, 1):
@@ -400,11 +412,7 @@ def _first_lens(
         found = _search(images[number], cameras, corners, catalog, progress, what)
         if found is not None:
             named, camera = found
-            return camera, {number: named.rotation}
-    raise InputError(
-        f"in none of {len(images)} images stars have names: too few are seen, this is not the night sky, or its "
-        f"diagonal field of view is not {_NARROWEST:g} to {_WIDEST:g} degrees: start from a camera file (--camera)"
-    )
+            yield camera, {number: named.rotation}
 
 
 def _plain_camera(focal: float, size: tuple[int, int], model: str) -> Camera:

@@ -17,6 +17,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.cli.main import app
 from kcal.io.images import write_png
+from kcal.sim.captures import drawn_lens
 from kcal.stars import SkyView
 from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import StarCamera, calibrate_by_stars, refine_by_stars
@@ -24,6 +25,7 @@ from kcal.stars.lens_fit import StarField, fit_star_lens
 from kcal.stars.sky import StarCatalog, cache_folder, pair_table
 from scripts.shared.infinity import error_at_infinity
 from scripts.shared.night_scenes import PLACE, SIZE, lens_difference, rendered, star_images, true_lens
+from scripts.shared.prescriptions import PRESCRIPTIONS
 from scripts.shared.traced import capture
 
 # Boards and stars together: one posterior, and whether they contradict each other.
@@ -213,6 +215,15 @@ def test_folders_of_caches(platform: str, folder: str, tmp_path: Path, monkeypat
 
 
 # A lens from stars alone: simulated, of which nothing is known, and from six real images.
+
+
+def test_a_lens_of_another_kind_that_explains_a_few_stars_is_not_the_end() -> None:
+    """With 1600 px, a fisheye gives eight stars in the middle of the first image names; the second image tells more."""
+    lens = drawn_lens(PRESCRIPTIONS["surveillance"], 1.0, 2, wander=1.0)
+    images, views = star_images(0.0, 10, 2, lens=lens)
+    found = calibrate_by_stars(images[:7:-1], views[:7:-1], lens.size, focal=1600.0)
+    assert found.refused == {}
+    assert float(found.lens.camera.params[0]) == pytest.approx(1599.5, abs=0.3)
 
 
 REAL = Path(os.environ.get("KCAL_DATA", ""), "stars")
