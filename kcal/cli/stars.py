@@ -279,8 +279,8 @@ def stars_command(
     tell(lens_turn_deg=turned)
     if turned > max(max(found.sigma_deg) for _, found in seen):
         out.print(
-            f"σ is of attitudes under this lens: its principal point, not known better, may turn all of them by "
-            f"± {turned:.2g}°; where pixels look is not concerned"
+            f"± is of the stars, under this lens: its principal point, not known better, may turn all attitudes by "
+            f"± {turned:.2g}° more; where pixels look does not change"
         )
     print_wrote(picture)
 

@@ -34,7 +34,7 @@ _MOST_ACROSS = 40  # squares or tags in a row
 _TOLERANCE = 0.35  # of a square: distance of a marker's center from where the others put it
 _SAME_SHARE = 0.03  # of a marker's side, or of a tag's: sizes nearer than this to an ordinary one are that
 _PLACED = 0.6  # of the markers seen: share that must lie as on one board
-_DRAWS = 100  # of four markers: of a share of 0.6, all of them lie on no four good ones once in a million times
+_DRAWS = 100  # of four markers: with so many, all draws contain a wrong one once in a million times
 _CELL = 4  # pixels of a marker's cell, where it is compared with a dictionary
 _CORRECTED = 0.6  # of the cells that a dictionary could correct: OpenCV's share
 Corners = dict[int, npt.NDArray[np.float64]]  # (4, 2) of each marker
@@ -51,7 +51,7 @@ class SeenMarkers(NamedTuple):
 def most_markers(image: npt.NDArray[np.uint8]) -> SeenMarkers:
     """The markers of that dictionary of which most are seen; none where fewer than four are."""
     best = SeenMarkers("", 1, {})
-    # What it rejects of a small dictionary are all quadrilaterals that might be markers.
+    # With a small dictionary, what is read and what is rejected are all quadrilaterals that may be markers.
     read, _, rejected = cv2.aruco.ArucoDetector(opencv_dictionary("apriltag_16h5")).detectMarkers(image)
     quads = [np.asarray(quad, np.float32).reshape(4, 2) for quad in (*read, *rejected)]
     for family in _FAMILIES:
