@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -82,9 +83,16 @@ def _like_markers(
     light = np.stack([cv2.threshold(one, 0, 1, cv2.THRESH_OTSU)[1] for one in straight])
     cells = light.reshape(-1, whole, _CELL, whole, _CELL).mean((2, 4))[:, border:-border, border:-border] > 0.5
     turned = np.stack([np.rot90(cells, turn, (1, 2)) for turn in range(4)])
-    codes = np.stack([cv2.aruco.Dictionary.getBitsFromByteList(one[None], size) for one in dictionary.bytesList])
-    amiss = (turned[:, :, None] != codes).sum((-2, -1))  # cells, by turn, quadrilateral, marker
+    amiss = (turned[:, :, None] != _codes(name)).sum((-2, -1))  # cells, by turn, quadrilateral, marker
     return int((amiss.min((0, 2)) <= most).sum())
+
+
+@functools.cache
+def _codes(name: str) -> npt.NDArray[np.uint8]:
+    """(M, S, S) the inner cells of all markers of a dictionary; 1 is light."""
+    dictionary = opencv_dictionary(name)
+    read, size = cv2.aruco.Dictionary.getBitsFromByteList, dictionary.markerSize
+    return np.stack([read(one[None], size) for one in dictionary.bytesList])
 
 
 def read_all(image: npt.NDArray[np.uint8], name: str, border: int = 1) -> Corners:

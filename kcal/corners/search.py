@@ -439,8 +439,11 @@ def refine_through_sizes(image: Gray, pixels: Tensor, board: Board, factor: floa
     corners 3 px off, too far for full size. Squares too small for refinement are left as they are.
     """
     whole = image.shape[1], image.shape[0]
-    halved = (4 * factor / 2**times for times in itertools.count())
-    factors = list(itertools.takewhile(lambda one: one > 1, halved))
+    factors = []
+    factor = 4 * factor
+    while factor > 1:
+        factors.append(factor)
+        factor = factor / 2
     # Each is reduced from the one twice as large, because reducing the largest image takes the time.
     steps, source = [], image
     for factor in reversed(factors):

@@ -70,15 +70,21 @@ def pixel_covariance(
     flat = places.reshape(-1, places.shape[-1])
     wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
     half = known.by_parameter(known.half())[:, wanted]
-    by_camera, by_motion, good = pixel_slopes(camera, camera.grid(*grid).reshape(-1, 2), math.inf, wanted)
-    by_turn = by_motion[..., :3]
-    # The turn that best undoes each parameter's effect.
-    undo = torch.linalg.lstsq(by_turn[good].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
+    undo = turns_like(camera, camera.grid(*grid).reshape(-1, 2), wanted)
     by_camera, by_motion, good = pixel_slopes(camera, flat, at, wanted)
     by_camera = by_camera - by_motion[..., :3] @ undo
     spread = by_camera @ half.T
     found = spread @ spread.transpose(-1, -2)
     return torch.where(good[:, None, None], found, torch.nan).reshape(*places.shape[:-1], 2, 2)
+
+
+def turns_like(camera: Camera, pixels: Tensor, wanted: list[int]) -> Tensor:
+    """(3, C) the turn, radians, that does to the image at pixels (N, 2) most nearly what a unit of each parameter does.
+
+    Of points at infinity; `wanted` are the numbers of the C parameters.
+    """
+    by_camera, by_motion, good = pixel_slopes(camera, pixels, math.inf, wanted)
+    return torch.linalg.lstsq(by_motion[good][..., :3].flatten(0, 1), by_camera[good].flatten(0, 1)).solution
 
 
 @torch.no_grad()

@@ -19,7 +19,11 @@ from kcal.sim.truth import PixelRectangle, TruthLens
 
 Floats = NDArray[np.float64]
 _SIZE = 256
-_LATTICE = np.random.default_rng(7).uniform(-1.0, 1.0, _SIZE * _SIZE).astype(np.float32)
+
+
+@functools.cache
+def _random_lattice() -> NDArray[np.float32]:
+    return np.random.default_rng(7).uniform(-1.0, 1.0, _SIZE * _SIZE).astype(np.float32)
 
 
 def smooth_noise(x: Floats, y: Floats, octaves: int = 3) -> Floats:
@@ -40,15 +44,16 @@ def smooth_noise(x: Floats, y: Floats, octaves: int = 3) -> Floats:
 
 
 def _one_octave(x: Floats, y: Floats) -> NDArray[np.float32]:
+    lattice = _random_lattice()
     column, row = np.floor(x), np.floor(y)
     u, v = (x - column).astype(np.float32), (y - row).astype(np.float32)
     u, v = u * u * (3 - 2 * u), v * v * (3 - 2 * v)
     left, top = column.astype(np.int32) % _SIZE, row.astype(np.int32) % _SIZE * _SIZE
-    right, bottom = (left + 1) % _SIZE, (top + _SIZE) % _LATTICE.size
-    upper = _LATTICE[top + left]
-    upper += u * (_LATTICE[top + right] - upper)
-    lower = _LATTICE[bottom + left]
-    lower += u * (_LATTICE[bottom + right] - lower)
+    right, bottom = (left + 1) % _SIZE, (top + _SIZE) % lattice.size
+    upper = lattice[top + left]
+    upper += u * (lattice[top + right] - upper)
+    lower = lattice[bottom + left]
+    lower += u * (lattice[bottom + right] - lower)
     return upper + v * (lower - upper)
 
 

@@ -20,7 +20,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.pose import fit_turn, seen_turned, vector_from_rotation
 from kcal.lens.projection import FAR
 from kcal.lens.rig import Origin
-from kcal.lens.uncertainty import pixel_slopes
+from kcal.lens.uncertainty import turns_like
 from kcal.locate.mounting import attitude
 from kcal.stars.detect import DetectedStars, detect_stars
 from kcal.stars.sky import identify, turn_between
@@ -413,17 +413,17 @@ def _on_earth(among: NamedStars, catalog: night_sky.StarCatalog, camera: Camera)
 
 
 def turn_by_lens(camera: Camera, pixels: Floats) -> float:
-    """One sigma, degrees, of the turn for which errors of the lens pass where stars (N, 2) are; 0 if none are known.
+    """How far errors of the lens may turn an attitude from stars at pixels (N, 2): one sigma, degrees.
 
-    Its principal point and the camera's attitude make up for each other: together they say where pixels look.
+    An error of the principal point looks like a turn of the camera; where pixels look stays the same. 0 if the camera
+    has no error bars.
     """
     known = None if camera.calibration is None else camera.calibration.known(camera.params.detach())
     if known is None:
         return 0.0
     wanted = [index for index, slot in enumerate(known.slots) if slot >= 0]
     half = known.by_parameter(known.half())[:, wanted]
-    by_camera, by_motion, good = pixel_slopes(camera, torch.from_numpy(pixels), math.inf, wanted)
-    turns = torch.linalg.lstsq(by_motion[good][..., :3].flatten(0, 1), by_camera[good].flatten(0, 1) @ half.T).solution
+    turns = turns_like(camera, torch.from_numpy(pixels), wanted) @ half.T
     return math.degrees(float(turns.norm(dim=1).max()))
 
 

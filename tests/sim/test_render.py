@@ -23,7 +23,7 @@ from kcal.sim.captures import (
     project_board,
     sample_board_poses,
 )
-from kcal.sim.coast import _LATTICE, smooth_noise
+from kcal.sim.coast import _random_lattice, smooth_noise
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import RenderOptions, invert_window, render_board, render_light
 from kcal.sim.truth import PixelRectangle, TruthLens, pixel_axes
@@ -288,7 +288,7 @@ def test_bad_options(option):
 
 
 def test_noise_joins_its_random_values_smoothly() -> None:
-    lattice = _LATTICE.reshape(256, 256)
+    lattice = _random_lattice().reshape(256, 256)
     x, y = np.meshgrid(np.arange(5.0), np.arange(4.0))
     np.testing.assert_allclose(smooth_noise(x, y, 1), lattice[:4, :5])
     # It goes around, and on both sides of zero.

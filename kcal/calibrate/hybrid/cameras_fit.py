@@ -306,8 +306,8 @@ def others_of(cameras: Sequence[CameraFit], board: int) -> dict[int, Gaussian | 
 def _but_one(messages: Sequence[Gaussian]) -> list[Gaussian | None]:
     """For each message, all others merged; None where there is no other. The work is linear in the messages."""
     before = itertools.accumulate([None, *messages[:-1]], _merged)
-    after = [*itertools.accumulate([None, *messages[:0:-1]], _merged)]
-    return [*map(_merged, before, reversed(after))]
+    after = itertools.accumulate([None, *reversed(messages[1:])], _merged)
+    return [*map(_merged, before, reversed([*after]))]
 
 
 def _merged(*messages: Gaussian | None) -> Gaussian | None:

@@ -583,8 +583,8 @@ def relative_bends(data: ViewData, best: Amplitudes, families: PriorFamilies) ->
         mean, spread = inverse @ left[..., None], inverse.diagonal(dim1=1, dim2=2)
         moment = (mean[..., 0].square() / best.variance + spread)[:, -BENDS:].sum(1) * math.exp(-2.0 * ratio[-1])
         before, found = relative, ((_TAILS + moment) / (_TAILS + BENDS)).sqrt()
-        # Views tell s w. Both at the best share: s and w in turn, each at its own best, would creep there (C. Liu,
-        # D. B. Rubin, Y. N. Wu 1998: parameter expansion to accelerate EM).
+        # Views tell s w alone. A factor goes from w to s, the likeliest one: s and w in turn, each at its own best,
+        # would creep (C. Liu, D. B. Rubin, Y. N. Wu 1998: parameter expansion to accelerate EM).
         pull = (ratio[-1] + 0.5 * math.log(best.variance) - usual[-1]) / sd[-1] ** 2
         size = math.sqrt((len(found) - pull / _TAILS) / float(found.square().reciprocal().sum()))
         relative, ratio[-1] = found / size, ratio[-1] + math.log(size)

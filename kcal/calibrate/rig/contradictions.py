@@ -254,7 +254,7 @@ def contradicting_source(work: Adjustment, solution: RigSolution, *, refuse: boo
     against, cure = [parts[i].name for i in rest], "measure again, correct the value or its sigma, or leave it out"
     if _test(parts, named, everything, _of_free_lenses(problem, known)).sigmas <= _DOUBT:
         against.append("what is known of the lenses")
-        cure = f"are these the lenses, and images of the size, of the calibrations? If so, {cure}"
+        cure = f"are these the lenses that were calibrated, and images of that size? If so, {cure}"
     others = " and ".join(filter(None, (", ".join(against[:-1]), against[-1])))
     text = f"{_name(parts, named)} {verb} {others}: {how} ({test.sigmas:.1f} standard deviations); {cure}"
     if equal:

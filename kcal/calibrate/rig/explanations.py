@@ -192,10 +192,10 @@ def without_behind(work: Adjustment, mask: Tensor, kept: Tensor, solver: LMOptio
         mask of the items that agree then, and of those behind.
     """
     behind, at = torch.zeros_like(mask), work.at("features")
-    while True:
+    while bool(kept[at].any()):
         over = _over_limit_behind(RigSolution(work.problem(kept), work.part(kept)))
         if not 0 < int((over > 1.0).sum()) <= len(over) / 2:
-            return kept, behind
+            break
         worst, before = at.start + kept[at].nonzero()[over.nan_to_num(0.0).argmax(), 0], work.state
         behind[worst] = True
         try:
@@ -203,7 +203,8 @@ def without_behind(work: Adjustment, mask: Tensor, kept: Tensor, solver: LMOptio
         except InputError:
             # The rest contradicts itself without it: sigmas tell that better than a refusal.
             behind[worst], work.state = False, before
-            return kept, behind
+            break
+    return kept, behind
 
 
 # Count what is left over to check where each camera of a rig stands.

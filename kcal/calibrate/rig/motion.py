@@ -235,6 +235,7 @@ class RigRows:
         own = moving @ moving.mT - by_pose @ by_pose.mT
         alone = own.diagonal(dim1=-2, dim2=-1).flatten()
         share = felt * torch.where(alone > 0, alone.rsqrt(), 0.0)
+        # Both products have the same eigenvalues beside zeros; the smaller one takes less time.
         few = len(share) <= share.shape[1]
         explained, basis = torch.linalg.eigh(share @ share.T if few else share.T @ share)
         basis = basis[:, explained > _UNFELT]
