@@ -328,7 +328,7 @@ class Keys(Mapping[str, Any]):
         for key in (key for key in self.content if key not in self.read):
             value, name = self.content[key], re.sub("^cam(?:era)?(?=[a-z])", "", bare(key))
             name = (BEFORE.fullmatch(name) or ("", "", name))[2]
-            found = flat(value)
+            found = flat([part for part in value if flat(part)] if isinstance(value, list) else value)
             if isinstance(value, Mapping) and found is None and not OTHER.search(name):
                 yield from Keys(value)._unread(f"{where}{key}.")
             if not found or not any(found):
@@ -336,6 +336,8 @@ class Keys(Mapping[str, Any]):
             if OTHER.search(name) and not (len(found) == 1 and re.fullmatch("[prt][12]|f", name)):
                 continue
             if _LENS.search(name) or 4 <= len(found) <= 14:
+                if isinstance(value, list) and flat(value) is None:
+                    raise ValueError(f"{where}{key} must be numbers")
                 shape = f"{len(found)} numbers" if len(found) > 1 else f"{found[0]:g}"
                 raise ValueError(
                     f"{where}{key} ({shape}) may describe the lens, and kcal does not know this name; rename it as the "

@@ -375,7 +375,7 @@ def _against_reference(
         action = "calibrate with the default lens (--model hybrid), or show the board from farther away"
         return Finding("pupil", "doubt", text, action, FAULTS)
     alike = plain and result.hybrid is None and found.model is not None and not trust.unexplained(found.model)
-    if alike and far > _image_rms(result.camera):
+    if alike and not _is_better(found.reference, result) and far > _image_rms(result.camera):
         text = (
             f"another lens model fits these views as well as {result.camera.model} and differs by {far:.2g} px, "
             "most where no board was"
@@ -383,6 +383,11 @@ def _against_reference(
         action = "calibrate with the default lens (--model hybrid), and show the board at the borders of the image"
         return Finding("model", "doubt", text, action, FAULTS)
     return None
+
+
+def _is_better(reference: CameraCalibrationResult | None, result: CameraCalibrationResult) -> bool:
+    """Whether the reference explains the corners better than the camera does."""
+    return reference is not None and reference.noise < 0.97 * result.noise
 
 
 def _board_fault(
@@ -393,7 +398,7 @@ def _board_fault(
     measured = options.hybrid and options.board != "exact"
     if reference is None or board is None or measured or not bool(board.amplitudes.any()):
         return ""
-    better = reference.noise < 0.97 * result.noise
+    better = _is_better(reference, result)
     if board.bending.value > _SURE * board.bending.sigma and better and not options.board_warp:
         return f"the board bends by {1e3 * board.bending.value:.2g} mm"
     if abs(board.stretch.value) > _SURE * board.stretch.sigma and better:

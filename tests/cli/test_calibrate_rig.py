@@ -136,7 +136,8 @@ class TestCalibrate:
         assert rows["cx"] == ["321.000", "fixed"]
         assert rows["k3"] == ["0", "fixed"]
         assert rows["fx"] == rows["fy"]
-        assert 0 < float(rows["cy"][1]) < 1
+        # The constraints are wrong, so that the views tell less than the prior, whose width is printed.
+        assert 0 < float(rows["cy"][1]) <= 1
         assert float(rows["skew"][1]) > 0
 
     @pytest.mark.parametrize(

@@ -356,6 +356,7 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
     "Gyroflow": ("a.json", {"calib_dimension": {"w": 640}, "fisheye_params": {"camera_matrix": M}}, "of Gyroflow"),
     "misspelled": ("a.yml", opencv("K", "distrotion_coeffs"), "distrotion_coeffs .5 numbers. may describe the lens"),
     "by shape": ("a.json", SIZE | {"K": M, "verzeichnung": D}, "verzeichnung .5 numbers. may describe the lens"),
+    "a word among numbers": ("a.json", SIZE | {"K": M, "D": [-0.3, "none", 0.0, 0.0]}, "D must be numbers"),
     "another matrix": (
         "a.json",
         SIZE | {"K": M, "D": D, "kamera": (K + 1).tolist()},

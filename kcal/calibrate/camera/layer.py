@@ -17,7 +17,7 @@ from kcal.calibrate.hybrid.measured_board import MeasuredBoard
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import CoefficientPrior, GaussianPrior, Term, is_overparameterized
 from kcal.calibrate.problem.state import BoardState
-from kcal.calibrate.problem.views import Views, uncertainty_of
+from kcal.calibrate.problem.views import Views, noise_variance, uncertainty_of
 from kcal.checks import StatedModule, as_points, require_finite
 from kcal.dispatch import is_differentiated
 from kcal.errors import DegenerateError, InputError
@@ -42,7 +42,8 @@ def exact_minimum(problem: BoardProblem, state: BoardState) -> tuple[BoardState,
     """
     state, found = newton_minimum(problem, state, _POLISH)
     if problem.shared_size:
-        known = uncertainty_of(found.linear, problem.residual_count, problem.shared_size + found.zero[1].numel())
+        count = problem.shared_size + found.zero[1].numel()
+        known = uncertainty_of(found.linear, float(noise_variance(found.linear, problem.residual_count, count)))
         names = [*problem.free.labels(parameter_names(problem.model)), *(["the board's warp"] * 2)]
         lost = [name for name, sure in zip(names, known.determined.tolist(), strict=False) if not sure]
         if lost:

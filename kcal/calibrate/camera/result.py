@@ -315,6 +315,8 @@ class CameraCalibrationResult(ArrowRows):
             a stabilizer or an autofocus moves the lens; None: all views have the same.
         moves: standard deviations of these, with room for their own errors, as `CalibrationRecord` says them.
         without: what the options left out of a hybrid lens, as `CalibrationRecord` says it.
+        tempering: of a parametric model, dispersion factor by which its variances are larger than independent errors of
+            corners make them, because residuals repeat within views; `hybrid.tempering` of the hybrid lens.
         shared_board: which cameras helped to measure the board, where several were calibrated together. Errors of such
             cameras are not quite independent of each other; a rig of them knows that.
     """
@@ -346,6 +348,7 @@ class CameraCalibrationResult(ArrowRows):
     by_view: Tensor | None = None
     moves: tuple[float, float, float] | None = None
     without: tuple[str, ...] = ()
+    tempering: float | None = None
     shared_board: SharedBoard | None = None
 
     def __post_init__(self) -> None:
@@ -384,7 +387,7 @@ class CameraCalibrationResult(ArrowRows):
             stop_reason=self.status.message,
             iterations=self.iterations,
             noise=self.noise,
-            tempering=None if self.hybrid is None else self.hybrid.tempering,
+            tempering=self.tempering if self.hybrid is None else self.hybrid.tempering,
             board_deviation=None if moved is None else tuple((x, y, z) for x, y, z in moved),
             without=self.without,
             moves=self.moves,

@@ -23,6 +23,7 @@ from kcal.calibrate.camera.checks import (
 from kcal.calibrate.camera.result import CalibrationOptions, CameraCalibrationResult, OutlierRejection, Progress
 from kcal.calibrate.camera.warnings import (
     NO_ERROR_BARS,
+    dispersion_findings,
     general_findings,
     outlier_findings,
     prior_findings,
@@ -35,6 +36,7 @@ from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import (
     LEAST_NOISE,
     CameraViews,
+    dispersion_of,
     information_of,
     noise_variance,
     poses_under,
@@ -402,7 +404,7 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
     squared, count = problem.pixel_errors(state).square().sum(-2), problem.seen.sum(-1)
     per_view, rms = torch.sqrt(squared.sum(-1) / count), float(torch.sqrt(squared.sum() / count.sum()))
 
-    uncertainty, information = _uncertainty(observations, solution, state, options.loss)
+    uncertainty, information, dispersion = _uncertainty(observations, solution, state, options.loss)
     free = problem.free
     slot = {camera.names[i]: k for i, k in zip(free.indices, free.slots, strict=True)}
     spread = free.by_parameter(uncertainty.matrix, len(camera.names))
@@ -418,7 +420,8 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
             problem.model,
             problem.points(state),
             problem.seen,
-            torch.full_like(spread, torch.inf) if open_focal else spread,
+            # Views that a poor lens does not fit have tilts enough.
+            torch.full_like(spread, torch.inf) if open_focal else spread / dispersion,
             state.rotation,
             observations.names,
         )
@@ -447,10 +450,12 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
         iterations=solution.spent,
         covariance=spread,
         information=information,
+        tempering=dispersion,
         findings=(
             *general_findings(observations.names, camera, rms, per_view, lost, status),
             *doubts,
             *rival_findings(camera, sigma, solution.rivals, solution.plain_cost, problem.residual_count),
+            *dispersion_findings(str(problem.model), dispersion),
             *prior_findings(problem.terms, solved.state, solution.views.prior_noise),
             *outlier_findings(
                 observations.names, weighted, stray_corners(weighted), "; this lens may need a richer model"
@@ -459,23 +464,36 @@ def assess(observations: Observations, solution: Solution, options: CalibrationO
     )
 
 
+class _Uncertainty(NamedTuple):
+    """Covariance of the unknowns; what is said of the camera, None where that is not finite; see `dispersion_of`."""
+
+    covariance: Covariance
+    information: CameraInformation | None = None
+    dispersion: float = 1.0
+
+
 def _uncertainty(
     observations: Observations, solution: Solution, state: BoardState, loss: RobustLoss | None
-) -> tuple[Covariance, CameraInformation | None]:
-    """Covariance of the unknowns, and what is said of the camera; None where that is not finite."""
+) -> _Uncertainty:
     if not solution.problem.shared_size:
         # Under a known camera and a flat board nothing is shared by the views.
-        return Covariance(state.parameters.new_zeros(0, 0), state.parameters.new_zeros(0)), None
+        return _Uncertainty(Covariance(state.parameters.new_zeros(0, 0), state.parameters.new_zeros(0)))
     # Barriers before folds are no information about the lens.
     known = [term for term in solution.problem.terms if isinstance(term, GaussianPrior)]
     plain = solution.problem_for(observations.pixels(), observations.covariances(), loss, known)
     linear = plain.linearize(state)
     count, residuals = plain.shared_size + 6 * len(state.translation), plain.residual_count + plain.prior_count
-    found = uncertainty_of(linear, residuals, count)
     variance = float(noise_variance(linear, residuals, count))
+    dispersion = dispersion_of(plain, state, variance)
+    if dispersion > 1.0:
+        # Of priors is known how much they count.
+        known = [dataclasses.replace(term, weight=term.weight * math.sqrt(dispersion)) for term in known]
+        plain = solution.problem_for(observations.pixels(), observations.covariances(), loss, known)
+        linear, variance = plain.linearize(state), variance * dispersion
+    found = uncertainty_of(linear, variance)
     if not found.computed or not variance > 0 or not len(plain.free):
-        return found, None
-    return found, information_of(plain, state, math.sqrt(variance)).without_board()
+        return _Uncertainty(found, None, dispersion)
+    return _Uncertainty(found, information_of(plain, state, math.sqrt(variance)).without_board(), dispersion)
 
 
 def _led_by_prior(

@@ -267,6 +267,18 @@ NO_ERROR_BARS = Finding(
 )  # fmt: skip
 
 
+def dispersion_findings(model: str, dispersion: float) -> list[Finding]:
+    """A note where error bars of a parametric model are widened much because residuals repeat within views."""
+    if dispersion <= REPEATING:
+        return []
+    text = (
+        f"residuals repeat within views (tempering {dispersion:.1f}, where noise alone gives 1): the board bends, "
+        f"something moved, or the lens is not quite {model}; error bars are {math.sqrt(dispersion):.1f} times as wide "
+        "as noise alone makes them"
+    )
+    return [Finding("patterns", "note", text, "calibrate with the default lens, which allows for all of these")]
+
+
 def prior_findings(terms: Sequence[Term], state: BoardState, noise: float) -> list[Finding]:
     """A doubt where parameters differ from their priors by much more than the priors allow.
 

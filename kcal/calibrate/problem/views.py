@@ -14,7 +14,7 @@ from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior, ParameterConstraints, Term
 from kcal.calibrate.problem.state import BoardState
 from kcal.corners.grid import direct_equations
-from kcal.gaussian import Covariance, triangular
+from kcal.gaussian import Covariance, triangular, whitened
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.model import LensModel
@@ -415,27 +415,58 @@ def free_parameters(model: LensModel) -> list[int]:
 _RANK_TOLERANCE = 1e-13
 # A parameter with this squared component in an undetermined direction counts as undetermined.
 _UNDETERMINED_SHARE = 1e-2
+# Standard deviations by which scores scatter more than independent corners explain, from which on that is no chance.
+_CHANCE = 2.0
 
 
-def uncertainty_of(linear: SchurLinearization, residual_count: int, parameter_count: int) -> Covariance:
+def uncertainty_of(linear: SchurLinearization, variance: float) -> Covariance:
     """Covariance of the shared parameters from the information at a minimum, all other parameters free.
 
-    (JᵀJ)⁻¹ ‖r‖² / (residuals - parameters), whose diagonal is the square of what `cv2.calibrateCameraExtended` reports:
-    the noise is estimated from the residuals themselves and assumed independent and equal. Where the linearization is
-    not finite, because a corner lies on a fold of the lens, nothing is determined.
+    With `noise_variance` it is (JᵀJ)⁻¹ ‖r‖² / (residuals - parameters), whose diagonal is the square of what
+    `cv2.calibrateCameraExtended` reports: the noise is assumed independent and equal. Where the linearization is not
+    finite, because a corner lies on a fold of the lens, nothing is determined.
 
     Args:
         linear: the linearization at the minimum, not a batch.
-        residual_count: scalar residuals.
-        parameter_count: all parameters that were free, poses included.
+        variance: of a residual.
     """
-    noise = float(noise_variance(linear, residual_count, parameter_count))
-    return Covariance(*linear.information(), noise, tolerance=_RANK_TOLERANCE, lost=_UNDETERMINED_SHARE)
+    return Covariance(*linear.information(), variance, tolerance=_RANK_TOLERANCE, lost=_UNDETERMINED_SHARE)
 
 
 def noise_variance(linear: SchurLinearization, residual_count: int, parameter_count: int) -> Tensor:
-    """Variance of a residual, estimated from the cost."""
+    """Variance of a residual, estimated from the cost, where so many parameters were free, poses included."""
     return 2.0 * linear.cost / max(residual_count - parameter_count, 1)
+
+
+def dispersion_of(problem: BoardProblem, state: BoardState, variance: float) -> float:
+    """How much more the views contradict each other than corners with independent errors do; 1 where chance may do it.
+
+    Where boards bend, cameras move or a lens differs from its model, residuals repeat within a view, and a view counts
+    for as many corners as it has though it has fewer independent ones. The derivatives of each view's χ² by lens and
+    board then scatter more from view to view than its information says, and variances are too small by that factor.
+
+    Args:
+        problem: with corners alone, or with priors, which do not count.
+        state: its minimum.
+        variance: of a residual.
+
+    Source:
+        R. Wedderburn, "Quasi-likelihood functions", Biometrika 61 (1974); per view, as in the variance of clustered
+        data, K.-Y. Liang and S. Zeger, Biometrika 73 (1986).
+    """
+    rows = problem.off_poses(state)[:, [*problem.moving.tolist(), -1]]
+    if not variance > LEAST_NOISE**2 or not bool(rows.isfinite().all()):
+        return 1.0
+    flat = rows.transpose(0, 1).flatten(1).T
+    change, _, known = whitened(flat[:, :-1], flat[:, -1])
+    unit = change[:, known].T @ rows[:, :-1]
+    score = (unit @ rows[:, -1:].transpose(1, 2))[..., 0]
+    # A view pulls the minimum towards itself, the more so the larger its share of the information.
+    shared = float((unit @ unit.transpose(1, 2)).square().sum())
+    freedom = max(int(known.sum()) - shared, 0.0)
+    expected, chance = variance * freedom, variance * math.sqrt(2.0 * shared)
+    squared = float(score.square().sum())
+    return squared / expected if squared > expected + _CHANCE * chance else 1.0
 
 
 # What corners and priors say of a camera and of its board, for every lens alike.

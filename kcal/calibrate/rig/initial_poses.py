@@ -27,6 +27,8 @@ _FOREIGN_PX, _FOREIGN_TIMES = 10.0, 10.0
 _LEVEL = 1e-3
 # Landmarks that place a camera in up to four ways.
 _AMBIGUOUS = 3
+# Cameras whose directions are tried in all combinations.
+_AT_ONCE = 1
 
 
 class TurnedBoard(NamedTuple):
@@ -66,11 +68,12 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
                     "together with another camera, four or better six landmarks, or features together with its "
                     "position or the baseline"
                 )
-        starts = _in_all_places(data, _starts(known, tried))
+        starts = _in_all_places(data, _starts(known, tried[:_AT_ONCE]))
+        views.tried = tried[_AT_ONCE:]
         if data.absolute and not placed:
             starts = [_into_frame(data, start) for start in starts]
     views.turn_all()
-    views.starts = [start._replace(boards=as_items(*views.world(start))) for start in starts]
+    views.starts = [views.with_boards(start) for start in starts]
     return views
 
 
@@ -147,18 +150,21 @@ def _baseline(data: RigData, one: int, other: int) -> float | None:
 
 def _starts(known: _Known, tried: list[int]) -> list[Start]:
     """The known poses, with each camera of `tried` in all six directions from another one."""
-    rotation, center = _stacked(known)
-    starts = [Start(rotation=rotation, center=center)]
+    starts = [Start(*_stacked(known))]
     for camera in tried:
-        other = 0 if camera != 0 else 1
-        length = float(torch.linalg.vector_norm(center[camera] - center[other]))
-        axes = torch.cat([rotation[other], -rotation[other]])
-        starts = [
-            start._replace(center=start.center.index_copy(0, torch.tensor([camera]), place[None]))
-            for start in starts
-            for place in start.center[other] + length * axes
-        ]
+        starts = [moved for start in starts for moved in around(start, camera)[:-1]]
     return starts
+
+
+def around(start: Start, camera: int) -> list[Start]:
+    """A start with a camera in all six directions from another one, and with all cameras on the other side of that."""
+    other = 0 if camera != 0 else 1
+    away = start.center - start.center[other]
+    places = torch.linalg.vector_norm(away[camera]) * torch.cat([start.rotation[other], -start.rotation[other]])
+    at = torch.tensor([camera])
+    moved = [away.index_copy(0, at, place[None]) for place in places]
+    # With far points the whole rig and its mirror image fit alike; only what is in front of the cameras tells.
+    return [start._replace(center=start.center[other] + each) for each in (*moved, -away)]
 
 
 def _in_all_places(data: RigData, starts: list[Start]) -> list[Start]:
@@ -196,6 +202,7 @@ class InitialPoses:
     Attributes:
         data: with boards turned where they had been read from the other end.
         starts: possible starts; the one with the best solution is used.
+        tried: cameras that are then moved to all six directions from another one, one after another.
         flipped: boards that were turned.
         foreign: indices of boards that do not belong, with the reason.
     """
@@ -203,6 +210,7 @@ class InitialPoses:
     def __init__(self, data: RigData, solver: LMOptions) -> None:
         self.data = data
         self.starts: list[Start] = []
+        self.tried: list[int] = []
         self.flipped: list[TurnedBoard] = []
         self.foreign: dict[int, str] = {}
         self._alone: list[Pose] = []
@@ -273,6 +281,10 @@ class InitialPoses:
         new = alone.some(views).after(half_turn(boards.points))
         alone.rotation[views], alone.translation[views] = new.rotation, new.translation
         self.flipped += [TurnedBoard(boards.names[i], self.data.names[camera]) for i in views.tolist()]
+
+    def with_boards(self, start: Start) -> Start:
+        """The start with boards where its cameras see them."""
+        return start._replace(boards=as_items(*self.world(start)))
 
     def world(self, start: Start) -> tuple[Tensor, Tensor]:
         """world_from_board from the first camera that sees each board well; where none does, an arbitrary pose."""

@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,9 +28,10 @@ from kcal.calibrate.rig.explanations import (
     refuse_same_camera,
     without_behind,
 )
-from kcal.calibrate.rig.initial_poses import InitialPoses, first_poses
+from kcal.calibrate.rig.initial_poses import InitialPoses, around, first_poses
 from kcal.calibrate.rig.pairs import Pair, evenly, paired_boards, pose_alone
 from kcal.calibrate.rig.result import Reasons, RigResult, records
+from kcal.calibrate.rig.source import Start
 from kcal.calibrate.rig.sources import MINIMUM_CORNERS, Boards, RigData
 from kcal.calibrate.rig.unknowns import SharedUnknowns, board_deviation, free, gathered, held, joint_unknowns, less
 from kcal.corners.observations import Observations
@@ -83,37 +84,57 @@ def without_rayless(data: RigData) -> tuple[RigData, list[Finding]]:
 
 # px: a corner's noise before the boards themselves tell it.
 _CORNER_SIGMA = 0.2
+# Times that each camera is moved at most.
+_ROUNDS = 3
 # Enough steps, and features, to tell which of several starts is best.
 _SCREENING, _SCREENED = LMOptions(max_iterations=25, tolerance=1e-6, residual_floor=1e-8), 300
 
 
 def robust_solution(initial: InitialPoses, mask: Tensor, unknowns: SharedUnknowns) -> Adjustment:
     """The best robust solution from all starts."""
-    boards = initial.data.boards
-    sigma = _CORNER_SIGMA if boards is None or boards.sigma is None else boards.sigma
-    best: tuple[float, Adjustment] | None = None
-    for start in initial.starts:
-        work = Adjustment(initial.data, start, unknowns, sigma)
-        some, features = mask.clone(), work.at("features")
-        taken = mask[features].nonzero()[:, 0]
-        some[features] = False
-        some[features.start + taken[evenly(len(taken), _SCREENED)]] = True
-        if unknowns.refine_lenses:
-            # From poses that are far off, lenses would bend towards them, beyond their folds even.
-            work.unknowns = unknowns.none()
-        here = possible(work, some)
-        work.fit_corners(here, robust=True)
-        problem, result = work.solve(here, _SCREENING, LOSS)
-        cost = float(result.cost) + cost_of_features_behind(problem, work.part(here))
-        cost += 1e6 * int((some & ~here).sum())
-        if best is None or cost < best[0]:
-            best = (cost, work)
-    assert best is not None
-    work, here = best[1], possible(best[1], mask)
+
+    def best_of(starts: Sequence[Start], *others: _Screened) -> _Screened:
+        screened = (_screened(initial, mask, unknowns, start) for start in starts)
+        return min((*others, *screened), key=lambda one: one.cost)
+
+    best, before = best_of(initial.starts), math.inf
+    for _ in range(_ROUNDS):
+        if best.cost == before:
+            break
+        before = best.cost
+        for camera in initial.tried:
+            best = best_of([initial.with_boards(start) for start in around(best.start, camera)], best)
+    work, here = best.work, possible(best.work, mask)
     work.unknowns = unknowns
     work.fit_corners(here, robust=True)
     work.solve(here, ROUGHLY, LOSS)
     return work
+
+
+class _Screened(NamedTuple):
+    """A start, and a few steps from there."""
+
+    cost: float
+    work: Adjustment
+    start: Start
+
+
+def _screened(initial: InitialPoses, mask: Tensor, unknowns: SharedUnknowns, start: Start) -> _Screened:
+    boards = initial.data.boards
+    sigma = _CORNER_SIGMA if boards is None or boards.sigma is None else boards.sigma
+    work = Adjustment(initial.data, start, unknowns, sigma)
+    some, features = mask.clone(), work.at("features")
+    taken = mask[features].nonzero()[:, 0]
+    some[features] = False
+    some[features.start + taken[evenly(len(taken), _SCREENED)]] = True
+    if unknowns.refine_lenses:
+        # From poses that are far off, lenses would bend towards them, beyond their folds even.
+        work.unknowns = unknowns.none()
+    here = possible(work, some)
+    work.fit_corners(here, robust=True)
+    problem, result = work.solve(here, _SCREENING, LOSS)
+    cost = float(result.cost) + cost_of_features_behind(problem, work.part(here)) + 1e6 * int((some & ~here).sum())
+    return _Screened(cost, work, start)
 
 
 # Take views of a rig out of what the cameras' calibrations know of them, so that no corner counts twice.

@@ -14,7 +14,7 @@ from kcal import Camera, DegenerateError, InputError
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState, warp_modes
-from kcal.calibrate.problem.views import free_parameters, uncertainty_of
+from kcal.calibrate.problem.views import free_parameters, noise_variance, uncertainty_of
 from kcal.solve import SolverStatus
 from kcal.solve.lm import LMOptions, minimize
 
@@ -162,7 +162,8 @@ class TestNumbers:
         known = dict(zip(names, out[5][:, 0].tolist(), strict=False))
         problem = BoardProblem(BOARD.points, pixels.double(), truth.model, free_parameters(truth.model))
         linear = problem.linearize(as_state(result))
-        sigmas = uncertainty_of(linear, problem.residual_count, problem.shared_size + 6 * len(pixels)).sigma
+        variance = noise_variance(linear, problem.residual_count, problem.shared_size + 6 * len(pixels))
+        sigmas = uncertainty_of(linear, float(variance)).sigma
         for name, sigma in zip(result.sigma, sigmas.tolist(), strict=True):
             # As above.
             assert sigma == pytest.approx(known[name], rel=1e-5 if model == "opencv5" else 1e-3), name

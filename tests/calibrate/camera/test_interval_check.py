@@ -133,8 +133,7 @@ def test_command(
     capture(2).save("second.obs.json")
     wrong = capture(3)
     views = tuple(
-        view.model_copy(update={"pixels": tuple((u * 0.98, v * 0.98 + 1e-5 * u * u) for u, v in view.pixels)})
-        for view in wrong.views
+        view.model_copy(update={"pixels": tuple((u * 0.98, v * 0.98) for u, v in view.pixels)}) for view in wrong.views
     )
     wrong.model_copy(update={"views": views}).save("wrong.obs.json")
 

@@ -79,7 +79,8 @@ class TestCamera:
         result = solved("right", "opencv5")
         assert result.rms == pytest.approx(rms, abs=1e-6)
         assert result.rms < 0.17
-        assert result.warnings == ()
+        # The board bends, which this lens does not allow for.
+        assert [finding.name for finding in result.findings] == ["patterns"]
         # The same camera to the digits at which OpenCV stops, which is far below σ (0.3 px).
         found = result.camera.matrix
         assert float(found[0, 0]) == pytest.approx(matrix[0, 0], abs=1e-2)

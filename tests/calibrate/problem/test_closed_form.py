@@ -266,8 +266,11 @@ def test_the_end_is_the_dense_optimum_and_sigma_its_inverse(options: dict[str, A
     jacobian = torch.autograd.functional.jacobian(residuals, zero)
     scale = jacobian.norm(dim=0)
     step = torch.linalg.lstsq(jacobian / scale, -r[:, None]).solution[:, 0] / scale
+    # Views that contradict each other under a wrong constraint count less; what the prior says does not.
+    tempering = result.tempering or 0.0
+    jacobian[len(r) - len(priors) :] *= math.sqrt(tempering)
     variance = torch.linalg.inv((jacobian / scale).T @ (jacobian / scale)).diagonal() / scale**2
-    sigma = torch.sqrt(variance * (r @ r) / (len(r) - len(zero)))
+    sigma = torch.sqrt(variance * (r @ r) * tempering / (len(r) - len(zero)))
     for k, group in enumerate(groups):
         assert abs(float(step[k])) < 1e-3 * float(sigma[k]), group
         for name in group:

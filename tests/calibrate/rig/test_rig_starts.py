@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 
@@ -15,6 +16,7 @@ from rig_scenes import (
     ROTATION,
     boards,
     features,
+    generator,
     landmarks,
     normal,
     spread_points,
@@ -24,6 +26,7 @@ from torch import Tensor
 
 from kcal import Baseline, Camera, MeasuredPosition, Rig, RigData
 from kcal.calibrate.rig.initial_poses import _baseline, _in_all_places, _into_frame, _level_starts, _starts
+from kcal.calibrate.rig.marks import Features
 from kcal.calibrate.rig.pairs import _median_rms, _view_rms, consensus, evenly, half_turn
 from kcal.calibrate.rig.resection import (
     _real_roots,
@@ -34,8 +37,9 @@ from kcal.calibrate.rig.resection import (
     distinct_poses,
     poses_from_three,
 )
+from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import Start
-from kcal.lens.pose import Pose, rotation_between, rotation_from_vector
+from kcal.lens.pose import Pose, rotation_between, rotation_from_vector, vector_from_rotation
 from kcal.report.judge_rig import synchrony
 
 
@@ -218,6 +222,40 @@ def positions(*cameras: int) -> tuple[MeasuredPosition, ...]:
     return tuple(MeasuredPosition(camera=c, point=CENTER[c], sigma=torch.full((3,), 0.02).double()) for c in cameras)
 
 
+def test_many_cameras_of_features_and_baselines_alone() -> None:
+    """Directions are tried camera by camera: of five cameras in all combinations they would be 1,296 starts.
+
+    In this draw all cameras but one had come to stand on the wrong side of the first, from where no single one leaves.
+    """
+    draw, count = generator(1), 4
+    noise = functools.partial(torch.randn, dtype=torch.float64, generator=draw)
+    camera = Camera.build(focal=(2000, 2000), center=(959.5, 539.5), size=(1920, 1080))
+    level = tensor([1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0])
+    rotation = torch.stack([rotation_from_vector(0.1 * noise(3)) @ level for _ in range(count)])
+    center = noise(count, 3) * tensor(10.0, 10.0, 3.0)
+    share = torch.rand(60, 3, dtype=torch.float64, generator=draw)
+    far, turn, rise = 100.0 * 20.0 ** share[:, 0], 0.7 * (share[:, 1] - 0.5), 0.4 * (share[:, 2] - 0.5)
+    points = torch.stack([far * turn.sin(), far * turn.cos(), far * rise], -1)
+    seen = []
+    for turned, place in zip(rotation, center, strict=True):
+        pixels, valid = camera.project((points - place) @ turned.T)
+        seen.append(torch.where((valid & camera.inside(pixels))[:, None], pixels + 0.1 * noise(60, 2), torch.nan))
+    far_points = Features(
+        names=tuple(f"peak {i}" for i in range(60)),
+        pixels=torch.stack(seen, 1),
+        inverse_range=torch.full((60,), 1e-3, dtype=torch.float64),
+        inverse_range_sigma=torch.full((60,), math.inf, dtype=torch.float64),
+        pixel_sigma=0.1,
+    )
+    away = (center - center[0]) @ rotation[0].T
+    tapes = [Baseline(first=0, second=c, length=float(away[c].norm()), sigma=0.01) for c in range(1, count)]
+    rig = RigData(cameras=(camera,) * count, names=tuple("abcd"), features=far_points, baselines=tuple(tapes))
+    found = solve_rig(rig, RigOptions(refraction=0.0, refraction_sigma=0.0))
+    assert float((found.center - away).abs().max()) < 0.1
+    turned = found.rotation @ (rotation @ rotation[0].T).transpose(-1, -2)
+    assert float(vector_from_rotation(turned).abs().max()) < 1e-3
+
+
 class TestPlaces:
     def test_lengths_between_cameras(self) -> None:
         measured = (Baseline(first=0, second=1, length=10.5, sigma=0.01),)
@@ -234,6 +272,7 @@ class TestPlaces:
         torch.testing.assert_close(places, wanted)
         assert all(torch.allclose(start.center[0], CENTER[0]) for start in starts)
         assert len(_starts(known, [])) == 1
+        assert len(_starts(known, [1, 0])) == 36
         first = _starts(known, [0])
         torch.testing.assert_close(first[0].center[0] - first[0].center[1], 2.0 * ROTATION[1, 0], rtol=0, atol=1e-9)
 
