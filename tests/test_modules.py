@@ -52,6 +52,7 @@ def test_each_module_has_a_case_and_a_row() -> None:
     assert set(modules()) - BASES == {name.partition(" (")[0] for name in CASES}
 
 
+@pytest.mark.slow
 @each
 def test_derivatives(case: Case, name: str) -> None:
     """Backward, forward and central differences agree by every input, parameter and buffer, for every result."""

@@ -43,6 +43,7 @@ def test_kinds(before: str, after: set[str]) -> None:
     assert {site.function for site in found} <= {"f"}
 
 
+@pytest.mark.slow
 def test_one_at_a_time_wherever_it_is() -> None:
     path = ROOT / "kcal" / "solve" / "lm.py"
     text = path.read_text(encoding="utf-8")

@@ -141,6 +141,7 @@ def test_a_changed_copy_is_another_module() -> None:
     assert_equal(run(points), module(points))
 
 
+@pytest.mark.slow
 def test_over_cameras() -> None:
     """`vmap` in a compiled graph: other parameters than those of the module."""
     several = [camera(), camera()]

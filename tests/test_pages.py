@@ -35,6 +35,7 @@ def faults(page: Any, name: str, sizes: tuple[tuple[int, int], ...] = SIZES) -> 
     return found + page.complaints
 
 
+@pytest.mark.slow
 @needs_browser
 @pytest.mark.parametrize("name", PAGES)
 def test_axe_finds_nothing(name: str, tmp_path: Path) -> None:

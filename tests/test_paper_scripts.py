@@ -33,6 +33,7 @@ def ran(name: str, **given: object) -> None:
     make(each, given, quick=False, write=True)
 
 
+@pytest.mark.slow
 def test_joint_training(monkeypatch: pytest.MonkeyPatch, written: Path) -> None:
     monkeypatch.setattr(train_eq12, "MODEL", "opencv5")
     monkeypatch.setattr(train_eq12, "RATES", [1e-4, 1e-3])
@@ -43,6 +44,7 @@ def test_joint_training(monkeypatch: pytest.MonkeyPatch, written: Path) -> None:
     assert float(rows[0][3]) < 0.5  # the noise is 0.28 px
 
 
+@pytest.mark.slow
 def test_the_network_alone(monkeypatch: pytest.MonkeyPatch, written: Path, tmp_path: Path) -> None:
     monkeypatch.setattr(train_net_lens, "RATES", [1.0, 10.0])
     ran("net lens", steps=3, lm_steps=5, seeds=1, views=4, picture=tmp_path / "steps.png")
@@ -50,6 +52,7 @@ def test_the_network_alone(monkeypatch: pytest.MonkeyPatch, written: Path, tmp_p
     assert (tmp_path / "steps.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_chain(monkeypatch: pytest.MonkeyPatch, written: Path, tmp_path: Path) -> None:
     truth = camera("opencv5", 1500.0, size := (1920, 1080))  # as the site's images
     seen = observe(pixels_of(truth, motions(truth, 10, 5), noise=0.1, seed=2), size=size)

@@ -40,6 +40,7 @@ def zoom_and_click(page: Any, side: str, place: Any) -> None:
     click_at(page, side, *place)
 
 
+@pytest.mark.slow
 def test_a_site_is_marked_by_clicks(tmp_path: Path) -> None:
     with (
         desk_of(tmp_path) as (desk, site),
@@ -99,6 +100,7 @@ def live_on(folder: Path) -> Iterator[subprocess.Popen[str]]:
         process.wait()
 
 
+@pytest.mark.slow
 def test_targets_are_watched_until_the_stream_ends(tmp_path: Path) -> None:
     site, generator = tracked_site(), torch.Generator().manual_seed(0)
     start = torch.tensor([[-30.0, 5.0, 150.0], [20.0, -10.0, 200.0]]).double()

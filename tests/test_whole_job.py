@@ -47,6 +47,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_from_images_to_positions(images: Path, tmp_path: Path) -> None:
     # Images to corners.
     seen = {}

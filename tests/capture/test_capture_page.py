@@ -18,6 +18,7 @@ for library in ("starlette", "uvicorn"):
 pytestmark = needs_browser
 
 
+@pytest.mark.slow
 def test_frames_are_shown_and_the_page_ends_it(tmp_path: Path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()

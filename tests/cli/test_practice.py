@@ -68,6 +68,7 @@ def folder(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "site"))
 
 
+@pytest.mark.slow
 def test_stars_say_how_the_camera_looks(made: Path) -> None:
     pytest.importorskip("erfa", reason="the extra `stars` is not installed")
     assert (made / "night" / night_name("left")).exists()

@@ -486,6 +486,7 @@ def slow_if_upright(image, board, refine):
 AMPLE, SCANT = 600.0, 0.3
 
 
+@pytest.mark.slow
 def test_calls_return_or_are_given_up():
     with Limited(AMPLE) as limited:
         assert limited(divmod, 7, 2) == (3, 1)

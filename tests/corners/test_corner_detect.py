@@ -218,6 +218,7 @@ def test_squares_counted_instead_of_corners(pictures):
         detect([folder / "a.png"], Board(columns=7, rows=6, square=0.02))
 
 
+@pytest.mark.slow
 def test_real_images_all_found_and_three_methods_agree(stereo):
     assert len(stereo) == 26
     ours, opencv, skimage = (detect(stereo, BOARD, refine) for refine in ("saddle", "opencv", "skimage"))
@@ -302,6 +303,7 @@ def test_detected_corners_are_the_true_ones(degrees):
     assert float((found.pixels - truth).abs().max()) < 0.05
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-89, 89), st.sampled_from([(6, 4), (5, 3), (7, 5)]), st.booleans())
 def test_ambiguous_board_is_read_upright(degrees, size, dark_first):

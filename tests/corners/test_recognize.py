@@ -114,6 +114,7 @@ def test_boards_of_strangers(images: str, text: str, kcal_data: Path) -> None:
     assert noted[0].seen.text == text
 
 
+@pytest.mark.slow
 def test_a_false_hit_does_not_make_another_board(kcal_data: Path, tmp_path: Path, command: Command) -> None:
     """OpenCV 5.0 finds 8x8 corners in one image of a board of 7x7; 5.1 does not."""
     if not cv2.__version__.startswith("5.0"):

@@ -79,6 +79,7 @@ class TestRadialFolds:
 
 
 class TestOtherTerms:
+    @pytest.mark.slow
     def test_constructed_lenses(self) -> None:
         """A small run of scripts/check/folds.py."""
         generator, unproven, found = np.random.default_rng(5), 0, 0

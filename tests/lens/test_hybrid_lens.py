@@ -173,6 +173,7 @@ class TestPupil:
 
 
 class TestDerivatives:
+    @pytest.mark.slow
     def test_second_derivatives_of_the_projection(self) -> None:
         vector = parameters(HYBRID, strong(HYBRID)).requires_grad_(True)
         camera = Camera(vector.detach(), size=(4, 3), model=HYBRID)

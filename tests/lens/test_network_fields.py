@@ -89,6 +89,7 @@ def test_the_network_is_split_before_its_last_layer(kind: str) -> None:
     assert all(part.requires_grad for part in given.parameters())
 
 
+@pytest.mark.slow
 @every
 def test_gradients_by_points_parameters_and_weights(kind: str) -> None:
     """Of projection and of the inverse, whose derivatives follow the implicit function theorem."""

@@ -239,6 +239,7 @@ def test_at_a_distance_a_shift_counts_too() -> None:
     assert far.translation.tolist() == [0, 0, 0]
 
 
+@pytest.mark.slow
 def test_cameras_that_agree_differ_at_the_stated_rate() -> None:
     generator = torch.Generator().manual_seed(0)
     found = [camera_difference(drawn(generator), drawn(generator), grid=(17, 13)) for _ in range(40)]

@@ -111,6 +111,7 @@ def test_bad_sightings_are_refused(tmp_path: Path) -> None:
         read_sightings(path, NAMES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ships", "aircraft"])
 def test_wrong_names_are_found(kind: str) -> None:
     found = one_draw(kind, 1)

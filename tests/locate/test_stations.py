@@ -56,6 +56,7 @@ def solved(seed: int = 0) -> Rig:
     return solve_rig(survey(seed=seed)[1]).stations(ORIGIN)
 
 
+@pytest.mark.slow
 def test_stations_are_solved_from_landmarks_of_their_own_and_their_file_says_all() -> None:
     truth, found = survey()[0], solved()
     errors = torch.cat([found.center - truth.center, torch.zeros(len(found), 0)], 1)

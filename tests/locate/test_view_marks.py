@@ -87,6 +87,7 @@ def test_a_long_table_must_be_in_order(tmp_path: Path, monkeypatch: pytest.Monke
         list(read_mark_chunks(path, CAMERAS))
 
 
+@pytest.mark.slow
 def test_a_long_table_is_located_as_a_short_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:

@@ -236,6 +236,7 @@ class TestLiveRig:
         assert found[1].rig is not None
         assert float(found[1].rig.baseline) == pytest.approx(10.0, abs=0.2)
 
+    @pytest.mark.slow
     def test_a_mark_in_one_image_worsens_nothing(self, site: MarkingSite) -> None:
         """Neither does one placed by hand: each counts with its own sigma."""
         names = [point.name for point in LANDMARKS]
@@ -267,6 +268,7 @@ class TestLiveRig:
         assert [item.name for item in found.items if not item.used] == ["post 5"]
         assert found.text.startswith("post 5 contradicts the other landmarks")
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("zoom", "blamed"), [(None, True), (0.24, False)])
     def test_marks_from_afar_are_not_blamed(self, site: MarkingSite, zoom: float | None, blamed: bool) -> None:
         """Clicked at 0.24 times, three marks are up to 6 px off: right ones, as far as anyone could see."""

@@ -46,6 +46,7 @@ def mark(page: Any, scene: MarkingSite, name: str, *sides: int) -> None:
         page.wait_for_function("([name, side]) => kcal.item(name)[side]", arg=[name, side])
 
 
+@pytest.mark.slow
 def test_windows_on_the_same_marks_follow_each_other(site: tuple[Desk, MarkingSite, str]) -> None:
     _, scene, address = site
     with chromium_page() as first:
@@ -95,6 +96,7 @@ def test_a_click_beside_the_picture_marks_nothing(site: tuple[Desk, MarkingSite,
         settled(page)
 
 
+@pytest.mark.slow
 def test_a_refusal_ends_with_its_reason(site: tuple[Desk, MarkingSite, str]) -> None:
     """Without a rig there is no proposal; the fourth landmark gives one, and the fifth begins without that sentence."""
     _, scene, address = site
@@ -126,6 +128,7 @@ BOXES = (
 )
 
 
+@pytest.mark.slow
 def test_letters_of_a_name_are_no_keys(site: tuple[Desk, MarkingSite, str]) -> None:
     desk, scene, address = site
     with chromium_page() as page:
@@ -180,6 +183,7 @@ def test_nothing_moves_and_nothing_is_covered(site: tuple[Desk, MarkingSite, str
         assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
+@pytest.mark.slow
 def test_marks_of_landmarks_are_removed_by_a_button(site: tuple[Desk, MarkingSite, str]) -> None:
     _, scene, address = site
     with chromium_page() as page:
@@ -196,6 +200,7 @@ def test_marks_of_landmarks_are_removed_by_a_button(site: tuple[Desk, MarkingSit
         assert not page.is_enabled("#take-left")
 
 
+@pytest.mark.slow
 def test_a_click_from_afar_says_what_it_is_worth(site: tuple[Desk, MarkingSite, str]) -> None:
     _, scene, address = site
     u, v = map(float, scene.pixels["post 12"][0])
@@ -231,6 +236,7 @@ SPREAD = """() => {
 }"""
 
 
+@pytest.mark.slow
 def test_names_stand_beside_marks(site: tuple[Desk, MarkingSite, str]) -> None:
     """As drawn: no name on a mark, none on another name."""
     _, _, address = site
@@ -242,6 +248,7 @@ def test_names_stand_beside_marks(site: tuple[Desk, MarkingSite, str]) -> None:
         assert min(a[2], b[2]) - max(a[0], b[0]) <= 0.5 or min(a[3], b[3]) - max(a[1], b[1]) <= 0.5
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_on_the_page(site: tuple[Desk, MarkingSite, str], monkeypatch: pytest.MonkeyPatch) -> None:
     """The mark waits on the page and is sent again; tables that could not be written are told in words."""
     desk, _, address = site

@@ -95,6 +95,7 @@ def assert_same_answers(camera: Camera, start: Any) -> None:
     assert float(plain[int(0.95 * len(plain))]) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
 def test_the_answer_does_not_depend_on_the_start(name: str) -> None:
     camera, fit = trained(name)

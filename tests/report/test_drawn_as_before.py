@@ -105,6 +105,7 @@ def same(one: object, other: object, size: float) -> bool:
     return one == other
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
 def test_as_before(name: str) -> None:
     found = drawn(FIGURES[name]())

@@ -114,6 +114,7 @@ def test_rigs_of_two_cameras_and_of_many() -> None:
     assert "no error bars of the poses" in found.text
 
 
+@pytest.mark.slow
 def test_calibrations_and_observations_are_their_pictures(calibrated: Any) -> None:
     found = read(calibrated)
     assert [picture.size[0] > 1000 for picture in found.pictures] == [True]

@@ -21,6 +21,7 @@ def matched() -> MatchedPair:
     return match_scene(CAMERAS, pair(1))
 
 
+@pytest.mark.slow
 def test_matches_are_as_far_from_the_truth_as_they_say(matched: MatchedPair) -> None:
     truth, _ = true_right(matched.pixels[:, 0])
     off = matched.pixels[:, 1] - truth
@@ -75,6 +76,7 @@ def test_what_moves_is_found_by_time() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_change_of_range_is_not_still(matched: MatchedPair) -> None:
     def images(seed: int, shift: int) -> tuple[torch.Tensor, torch.Tensor]:
         one = pair(seed)

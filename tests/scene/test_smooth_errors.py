@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -48,6 +49,7 @@ def test_three_errors_across_the_lines() -> None:
         torch.testing.assert_close(found, SIZE_OF_EACH * amount[:, None] * across, rtol=1e-12, atol=0.0)
 
 
+@pytest.mark.slow
 def test_a_pose_is_as_uncertain_as_they_make_it() -> None:
     """The variances of generalized least squares with errors that matches share, and ones that do not vanish."""
     floor = []

@@ -78,6 +78,7 @@ def test_same_seed_same_poses_and_the_global_generator_is_left_alone():
     assert torch.equal(before, torch.get_rng_state())
 
 
+@pytest.mark.slow
 def test_pairs_are_seen_by_both_cameras():
     rig, board = demo_rig(), BoardSize(9, 6, 0.4)
     poses = sample_pair_poses(rig, board, 8, seeded(4), distance=(13.0, 28.0))

@@ -64,6 +64,7 @@ def test_unseen_points_are_refused():
         mark_points(demo_rig(), torch.ones(1, 3), -0.1, torch.Generator())
 
 
+@pytest.mark.slow
 def test_squares_are_large_enough_to_be_found():
     """Also far away, tilted and pressed together by the distortion at the image's edge."""
     scene = DemoScene(seed=5)
@@ -96,6 +97,7 @@ def test_rendered_demo():
         assert int(patch.max() - patch.min()) > 100
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes():
     first, again, other = (next(render_demo(DemoScene(seed=seed, near_views=2))) for seed in (2, 2, 3))
     assert torch.equal(first.image, again.image)

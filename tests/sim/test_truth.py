@@ -134,6 +134,7 @@ def test_the_pupil_wanders_by_its_share() -> None:
     assert pupil_wander(none) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -53,6 +53,7 @@ def solved(given: SkylineSource) -> RigResult:
     return solve_rig(RigData(cameras=cameras, names=("left", "right"), positions=places, skyline=given))
 
 
+@pytest.mark.slow
 def test_a_rig_from_skylines_and_positions_alone() -> None:
     result = solved(source(0))
     place = small_site().place
@@ -84,6 +85,7 @@ def test_cameras_side_by_side_share_the_errors_of_the_raster() -> None:
     assert float(off.norm()) < 4 * math.sqrt(float(covariance.matrix[-6:-3, -6:-3].trace()))
 
 
+@pytest.mark.slow
 def test_more_images_do_not_average_the_terrain() -> None:
     one, three = (station_mounting(solved(source(*m)).stations(small_site().place), 0) for m in ((0,), (0, 1, 2)))
     ratio = (three.covariance.diagonal()[3:6] / one.covariance.diagonal()[3:6]).sqrt()

@@ -30,6 +30,7 @@ def turn_error(found: Any, truth: torch.Tensor) -> torch.Tensor:
     return vector_from_rotation(relative @ (truth[1] @ truth[0].T).T)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("named", "seeds", "least", "most"), [(True, 12, 16, 66), (False, 2, 0.3, 23)])
 def test_the_relative_attitude_has_its_sigma(named: bool, seeds: int, least: float, most: float) -> None:
     """χ² of the relative rotation over 3 degrees of freedom, the clock being drawn from its sigma."""

@@ -148,6 +148,7 @@ def found() -> StarCamera:
     return made
 
 
+@pytest.mark.slow
 def test_the_lens_is_found(found: StarCamera) -> None:
     lens = found.lens
     error = lens_difference(found)
@@ -217,6 +218,7 @@ def test_folders_of_caches(platform: str, folder: str, tmp_path: Path, monkeypat
 # A lens from stars alone: simulated, of which nothing is known, and from six real images.
 
 
+@pytest.mark.slow
 def test_a_lens_of_another_kind_that_explains_a_few_stars_is_not_the_end() -> None:
     """With 1600 px, a fisheye gives eight stars in the middle of the first image names; the second image tells more."""
     lens = drawn_lens(PRESCRIPTIONS["surveillance"], 1.0, 2, wander=1.0)
@@ -249,6 +251,7 @@ def test_a_lens_from_stars() -> None:
     assert abs(float(found.lens.camera.params[0] - true_lens().params[0])) < 5 * focal_sigma
 
 
+@pytest.mark.slow
 def test_a_fisheye_of_which_nothing_is_known() -> None:
     """140 degrees between the corners, which no pinhole has."""
     lens = Camera.build(focal=(618, 618), center=(642, 396), size=SIZE, model="fisheye4")

@@ -158,6 +158,7 @@ os.kill(os.getpid(), 9)
 """
 
 
+@pytest.mark.slow
 def test_a_killed_watch_continues(tmp_path: Path) -> None:
     history = tmp_path / "h.csv"
     killed = subprocess.run([sys.executable, "-c", _KILLED, str(history), os.getcwd()], check=False)

@@ -50,6 +50,7 @@ def test_turns_of_both_cameras_are_found(then: tuple[FixedFeatures, FixedFeature
     assert not found.note
 
 
+@pytest.mark.slow
 def test_matches_between_the_cameras_tell_the_relative_turn(now: ImagePair) -> None:
     matched = match_scene((RIG.left, RIG.right), now)
     values, covariance = between_turn(RIG, matched)
@@ -59,6 +60,7 @@ def test_matches_between_the_cameras_tell_the_relative_turn(now: ImagePair) -> N
     assert math.degrees(float(covariance[0, 0].sqrt())) < 0.003
 
 
+@pytest.mark.slow
 def test_a_dirty_lens_makes_it_unsure_and_is_said(then: tuple[FixedFeatures, FixedFeatures], now: ImagePair) -> None:
     clean = seen_by(RIG.left, then[0], now.left, NOTHING[:3], "left")
     dirty = now.left.copy()
@@ -75,6 +77,7 @@ def test_a_dirty_lens_makes_it_unsure_and_is_said(then: tuple[FixedFeatures, Fix
     assert not dark.lost
 
 
+@pytest.mark.slow
 def test_a_jump_beyond_the_near_search_is_found(then: tuple[FixedFeatures, FixedFeatures]) -> None:
     turns = torch.tensor([0.0, 0.03, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)  # 15 px
     there = seen_by(RIG.left, then[0], pair(3, turns=turns).left, NOTHING[:3], "left")
@@ -91,6 +94,7 @@ def test_another_lens_is_refused(then: tuple[FixedFeatures, FixedFeatures], now:
         seen_by(RIG.left, then[0], now.left[:-1], NOTHING[:3], "left")
 
 
+@pytest.mark.slow
 def test_another_view_is_lost(then: tuple[FixedFeatures, FixedFeatures]) -> None:
     other = seen_by(RIG.left, then[0], pair(5, texture=0.37).right[::-1].copy(), NOTHING[:3], "left")
     assert other.lost

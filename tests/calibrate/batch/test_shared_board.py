@@ -92,6 +92,7 @@ def together(jobs: list[CameraJob], folder: Path, alone: set[Path] | None = None
     return results, here, advanced
 
 
+@pytest.mark.slow
 def test_cameras_that_share_a_board_are_calibrated_together(jobs: list[CameraJob], tmp_path: Path) -> None:
     assert sharing_jobs(jobs) == [[0, 1]]
     alone: set[Path] = set()

@@ -290,6 +290,7 @@ class TestDegenerate:
         pixels[3, [i for i in range(BOARD.corners) if i % 7]] = torch.nan
         assert "lie on one line" in _left_out(solve(pixels))["v03"]
 
+    @pytest.mark.slow
     def test_too_few_corners_in_all(self) -> None:
         pixels = corner_pixels(3, 1, "opencv14")
         keep = [0, 6, 35, 41, 20, 16]

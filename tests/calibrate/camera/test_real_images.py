@@ -124,6 +124,7 @@ def rigs(seen: dict[str, Observations], solved: Solve) -> dict[bool, RigResult]:
 
 
 class TestRig:
+    @pytest.mark.slow
     def test_is_opencvs(self, seen: dict[str, Observations], rigs: dict[bool, RigResult]) -> None:
         result = rigs[False]
         assert len(result.pairs) == 13
@@ -190,6 +191,7 @@ def test_a_lens_seen_in_a_ring_alone_is_solved_to_the_end(kcal_data: Path) -> No
     assert found.rms / 2**0.5 < found.hybrid.sigma < 2.0 * found.rms
 
 
+@pytest.mark.slow
 def test_four_views_of_a_stranger(kcal_data: Path) -> None:
     """Two focal lengths led them astray: no lens showed all corners."""
     seen = Observations.load(kcal_data / "captures" / "gavin_r.obs.json")

@@ -128,6 +128,7 @@ class TestGroups:
         assert result.rejected_views == ()
         assert any("corner 7 of view 04 by" in text for text in result.warnings)
 
+    @pytest.mark.slow
     def test_parametric_lenses_too(self) -> None:
         with pytest.raises(InputError, match="the views are not of one camera"):
             calibrate_camera(capture(zoomed(1.05)), CalibrationOptions(model="opencv5"))

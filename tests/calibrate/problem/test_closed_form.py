@@ -239,6 +239,7 @@ def values(result: CameraCalibrationResult) -> dict[str, float]:
     return dict(zip(result.camera.names, result.camera.params.tolist(), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("options", "groups"), CASES)
 def test_the_end_is_the_dense_optimum_and_sigma_its_inverse(options: dict[str, Any], groups: list[list[str]]) -> None:
     """A dense Gauss-Newton step from the result, by autograd and lstsq over the unknowns and all poses, is nothing."""

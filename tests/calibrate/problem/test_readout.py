@@ -321,6 +321,7 @@ def test_motion_is_found_and_taken_out() -> None:
     torch.testing.assert_close(found.residuals_of(capture(2e-3)), found.residuals, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_motions_do_not_take_up_the_noise_of_many_corners() -> None:
     """20 still views of 961 corners: no motion, the noise as it is, and the focal length within its error bar."""
     board = Board(columns=31, rows=31, square=0.03)

@@ -83,6 +83,7 @@ class TestRedundancy:
 
 
 class TestSeveralSolutions:
+    @pytest.mark.slow
     def test_three_landmarks_and_a_baseline_begin_everywhere(self) -> None:
         """Of up to four places of each camera, the baseline tells which ones belong together."""
         for seed in range(2):

@@ -168,6 +168,7 @@ def test_motion_is_found_and_taken_out() -> None:
     assert not any("same moment" in text for result in moving for text in result.warnings)
 
 
+@pytest.mark.slow
 def test_nothing_moves_on_a_stand() -> None:
     for seed in range(3):
         found, still = solve(False, seed), solve(False, seed, motion=False)
@@ -213,6 +214,7 @@ def taken_apart(seed: int, turn: float, *, later: int = 0, bump: float = 0.0, sh
     return calibrate_rig(CAMERA, CAMERA, *seen, [(name, name) for name in seen[0].names])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.001, 0.005])
 def test_pairs_that_were_not_taken_at_one_moment_scatter(turn: float) -> None:
     found = [taken_apart(seed, turn) for seed in range(3)]

@@ -78,6 +78,7 @@ def located(found: RigResult, seed: int, noise: float) -> tuple[float, float, bo
     return error, float(there.inverse_range_sigma), bool(there.range_low <= DISTANCE <= there.range_high)
 
 
+@pytest.mark.slow
 def test_ranges_have_the_errors_that_the_rig_says() -> None:
     """Refits with new errors of calibration, survey and marks scatter as far as sigma says: less than for two."""
     seeds = range(8)
@@ -91,6 +92,7 @@ def test_ranges_have_the_errors_that_the_rig_says() -> None:
     assert located(twice, 0, 0.0)[1] > 1.8 * errors[0][1]
 
 
+@pytest.mark.slow
 def test_the_lens_is_one() -> None:
     """Both places have the same refined lens, whose errors are the same error; a copy of the camera is that camera."""
     camera = calibrated(0)

@@ -78,6 +78,7 @@ def test_views_in_both_count_once() -> None:
     torch.testing.assert_close(sigma[0], sigma[1], rtol=1e-3, atol=0)
 
 
+@pytest.mark.slow
 def test_further_views_help() -> None:
     """Eight of the calibration's fourteen views in the rig: better than these alone, no better than all of them."""
     some, alone, everything = rig("hybrid", 14, 8), rig("hybrid", 8, 8), rig("hybrid", 14, 14)
@@ -177,6 +178,7 @@ def sharing(both: tuple[Camera, Camera], known: list[CameraInformation], board: 
     return tuple(part is not None and part.board_size > 0 for part in gathered(both, known, board)[0])
 
 
+@pytest.mark.slow
 def test_one_board_is_shared_and_two_are_not() -> None:
     """By the evidence: both cameras saw this board; the same pattern printed again is another board."""
     names = tuple(f"{i}.png" for i in range(14))

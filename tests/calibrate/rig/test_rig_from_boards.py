@@ -253,6 +253,7 @@ class TestWeights:
 class TestScatter:
     """Corners of one board that are off alike tell less than their noise and number say."""
 
+    @pytest.mark.slow
     def test_covariance_knows_of_views_that_are_shifted(self) -> None:
         """By .06 px each, which shows in no residual; without a test of it χ² of the pose is 6 times too large."""
         squares = []
@@ -341,6 +342,7 @@ class TestWrongPairs:
         kept = torch.tensor([0, 1, 3, 4, 6, 7])
         assert float(result.stereo().baseline) == pytest.approx(float(solve(pixels[kept]).stereo().baseline), rel=1e-6)
 
+    @pytest.mark.slow
     def test_stay_and_are_named_where_nothing_is_rejected(self) -> None:
         pixels = views(8, 2, noise=0.1)
         pixels[3, 1] += 40.0
@@ -406,6 +408,7 @@ class TestRefusals:
         with pytest.raises(InputError, match=r"right observations do not fit the right camera \(RMS \d+\.\d px\)"):
             solve(views(5, 1), right=other)
 
+    @pytest.mark.slow
     def test_a_camera_that_is_merely_wrong_is_warned_of(self) -> None:
         other = Camera.build(focal=(800, 800), center=(320, 240), size=SIZE)
         assert "if nothing moved, a camera is wrong" in solve(views(6, 1), right=other).warnings[0]

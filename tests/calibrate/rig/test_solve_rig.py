@@ -261,6 +261,7 @@ class TestRecovery:
 
 
 class TestFrame:
+    @pytest.mark.slow
     @settings(max_examples=6)
     @given(turn=st.tuples(*[st.floats(-3.0, 3.0)] * 3), shift=st.tuples(*[st.floats(-5e4, 5e4)] * 3))
     def test_the_solution_moves_with_the_frame(self, turn: tuple, shift: tuple) -> None:
@@ -319,6 +320,7 @@ class TestHybrid:
 
 
 class TestIntrinsics:
+    @pytest.mark.slow
     def test_priors_and_free_parameters(self) -> None:
         # What 30 close views would leave: a few tenths of a pixel of fx, fy, cx, cy.
         spread = torch.zeros(10, dtype=torch.float64)
@@ -394,6 +396,7 @@ class TestIntrinsics:
 
 
 class TestCovariance:
+    @pytest.mark.slow
     def test_is_the_spread(self) -> None:
         """20 rigs: the sum of squared errors in sigmas is χ² with 120 degrees of freedom, ± 4 of its deviations."""
         total = [0.0, 0.0]
@@ -467,6 +470,7 @@ class TestWrong:
             without = solve_rig(rest, RigOptions(reject=False))
             assert float(falls[i]) == pytest.approx(whole.chi2 - without.chi2, rel=2e-2)
 
+    @pytest.mark.slow
     def test_lenses_that_are_not_quite_their_models_make_no_board_wrong(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """They bend some boards more than others, by much more than corners that are this good would ever be off."""
         shown = boards(count=8, noise=0.01)

@@ -71,6 +71,7 @@ class TestRefused:
         with pytest.raises(DegenerateError, match="close together"):
             solved(surveyed(points, 3))
 
+    @pytest.mark.slow
     def test_the_remedy_helps(self) -> None:
         found = solved(row(0, 0.0), sigma=0.05)
         assert found.warnings == ()
@@ -87,6 +88,7 @@ class TestRefused:
 
 
 class TestWidened:
+    @pytest.mark.slow
     def test_intervals_contain_the_truth(self) -> None:
         """Walls that face the cameras: widened intervals contain the truth, first-order ones too seldom."""
         targets = box((0.9, 0.5, 0.0), (0.0, 0.0, 1.0), 5, 40) * torch.linspace(250.0, 5000.0, 40).double()[:, None]
@@ -202,6 +204,7 @@ class TestOneCamera:
         with pytest.raises(DegenerateError, match=text):
             solve_rig(station(extent, seed, count)[0], HELD)
 
+    @pytest.mark.slow
     def test_others_are_not(self) -> None:
         """Spread landmarks, also flat ground, give a place within its error bars, however open it is."""
         shares = []
