@@ -14,6 +14,7 @@ relative pose over its six degrees of freedom, and z, the difference of inverse 
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 import statistics
@@ -167,42 +168,44 @@ def real(kept: Kept = NOT_KEPT, captures: tuple[str, ...] = ("all",)) -> list[st
     return lines(sorted((r for r in records if r["key"][0] in wanted), key=lambda r: wanted.index(r["key"][0])))
 
 
-def _part(name: str, count: int, seed: int) -> Record:
+def _part(name: str, model: str, count: int, seed: int) -> Record:
     """A camera of so many views of a capture, drawn at random, against that of its other views."""
     seen = load(name).seen
     drawn = random.Random(f"{name} {count} {seed}").sample(seen.names, count)
     cameras: list[Camera] = []
     for views in (drawn, [view for view in seen.names if view not in drawn]):
         try:
-            cameras.append(calibrate_camera(seen.subset(views)).camera)
+            cameras.append(calibrate_camera(seen.subset(views), CalibrationOptions(model=model)).camera)
         except KcalError as error:
             return {"refused": "rest" if cameras else "part", "why": str(error)}
     between = camera_difference(*cameras)
     return {"ratio": between.ratio, "p": between.probability}
 
 
-@section("ordinary.md", "parts", captures=("st1_l",), views=(4,), seeds=range(1))
+@section("ordinary.md", "parts", captures=("st1_l",), models=("hybrid",), views=(4,), seeds=range(1))
 def parts(
     kept: Kept = NOT_KEPT,
     captures: tuple[str, ...] = ("all",),
+    models: tuple[str, ...] = ("hybrid", "opencv8"),
     views: tuple[int, ...] = (4, 6, 8, 12),
     seeds: range = range(2),
 ) -> Lines:
-    """Names of captures, and how many of their views are drawn."""
+    """Names of captures, lenses, and how many of the views are drawn."""
     sizes = {name: len(load(name).seen.views) for name in (names() if captures == ("all",) else captures)}
     keys = [
-        (name, count, seed) for name, size in sizes.items() for count in views for seed in seeds if 2 * count <= size
-    ]
+        (name, model, count, seed)
+        for name, size in sizes.items() for model in models for count in views for seed in seeds if 2 * count <= size
+    ]  # fmt: skip
     records = kept.records(keys, _part)
-    yield ["views", "parts", "refused", "the rest refused", "p < 5 %", "p < 1 %", "median ratio", "largest"]
-    for count in views:
-        ours = [record for record in records if record["key"][1] == count]
+    yield ["lens", "views", "parts", "refused", "the rest refused", "p < 5 %", "p < 1 %", "median ratio", "largest"]
+    for model, count in itertools.product(models, views):
+        ours = [record for record in records if record["key"][1:3] == [model, count]]
         known = sorted((record for record in ours if "ratio" in record), key=lambda record: record["ratio"])
         refused = [sum(record.get("refused") == which for record in ours) for which in ("part", "rest")]
         beyond = [sum(record["p"] < level for record in known) for level in (0.05, 0.01)]
         middle = statistics.median(record["ratio"] for record in known)
         worst = f"{known[-1]['ratio']:.2f} (`{known[-1]['key'][0]}`)"
-        yield list(map(str, [count, len(ours), *refused, *beyond, f"{middle:.2f}", worst]))
+        yield list(map(str, [model, count, len(ours), *refused, *beyond, f"{middle:.2f}", worst]))
 
 
 # Left and right of captures by two cameras, view by view at the same moments.
