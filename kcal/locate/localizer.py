@@ -321,7 +321,7 @@ class Localizer(Operations, Movable, StatedModule):
                 has no place on the Earth.
         """
         count, like = len(self.rig), self.rig.translation
-        if other is not None and not (isinstance(other, Tensor) and other.dtype == torch.bool):
+        if other is not None and not str(getattr(other, "dtype", "")).endswith("bool"):
             if count != 2:
                 raise InputError(
                     f"seen: bool is needed; left and right are pixels of two cameras, and this rig has {count}"
