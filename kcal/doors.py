@@ -13,6 +13,7 @@ function or class is the same object wherever it is imported from, so kcal's own
 from __future__ import annotations
 
 import ast
+import dataclasses
 import functools
 import importlib
 import inspect
@@ -111,18 +112,31 @@ def _slip(function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str,
         given = inspect.signature(function).bind(*args, **kwargs)
     except TypeError:  # of missing arguments: Python says which
         return ""
-    for name, value in given.arguments.items():
-        word = function.__annotations__.get(name, "Any")
+    single = {n: v for n, v in given.arguments.items() if given.signature.parameters[n].kind not in (_MANY, _NAMED)}
+    owner = function.__qualname__.removesuffix(".__init__")
+    found = _misfit(owner, single, function.__annotations__, function.__globals__)
+    # Options are records, whose fields nobody has looked at.
+    for record in single.values():
+        kind = type(record)
+        if not found and dataclasses.is_dataclass(kind) and kind.__module__.startswith("kcal."):
+            found = _misfit(kind.__name__, vars(record), kind.__annotations__, vars(sys.modules[kind.__module__]))
+    return found
+
+
+def _misfit(owner: str, values: dict[str, Any], words: dict[str, str], names: dict[str, Any]) -> str:
+    """Which of several values is another thing than its annotation says, given what the names in those mean."""
+    for name, value in values.items():
+        word = words.get(name, "Any")
         try:
-            fits = _is_kind(value, eval(word, function.__globals__))
+            fits = _is_kind(value, eval(word, names))
         except (NameError, AttributeError, TypeError):  # what only type checkers know
             continue
-        if not fits and given.signature.parameters[name].kind not in (_MANY, _NAMED):
+        if not fits:
             found = type(value).__name__
             if isinstance(value, Sequence) and not isinstance(value, str):
                 found += f" of {', '.join(dict.fromkeys(type(one).__name__ for one in value)) or 'nothing'}"
             makers = next((f"; {_MAKERS[made]} makes one" for made in _MAKERS if made in re.findall(r"\w+", word)), "")
-            return f"{function.__qualname__.removesuffix('.__init__')}: {name}: {word} is needed, got {found}{makers}"
+            return f"{owner}: {name}: {word} is needed, got {found}{makers}"
     return ""
 
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import kcal
-from kcal import Board, Camera, InputError, KcalWarning, Localizer, Observations, Origin, Rig, View
+from kcal import Board, CalibrationOptions, Camera, InputError, KcalWarning, Localizer, Observations, Origin, Rig, View
 from kcal.corners import refine_point
 from kcal.doors import _is_kind, _naming_slips
 from kcal.lens import camera_difference, pixel_covariance, rotation_from_vector, vector_from_rotation
@@ -58,6 +58,14 @@ def test_what_is_no_slip_keeps_its_error() -> None:
         _naming_slips(ours)(3)
     with pytest.raises(TypeError, match="missing 1 required positional argument: 'second'"):
         camera_difference(CAMERA)  # type: ignore[call-arg]
+
+
+def test_a_slip_in_options_is_named() -> None:
+    def fit(options: CalibrationOptions) -> object:
+        return options.reject.limit  # type: ignore[union-attr]
+
+    with pytest.raises(InputError, match=r"CalibrationOptions: reject: OutlierRejection \| None is needed, got bool"):
+        _naming_slips(fit)(CalibrationOptions(model="opencv5", reject=True))  # type: ignore[arg-type]
 
 
 def test_functions_stay_what_they_are() -> None:

@@ -367,7 +367,9 @@ class CameraRays(Float64Module):
         if is_differentiated(self) or not (is_traced() or may_branch(*self.cameras.parameters())):
             return self._measured()
         if not is_traced() and self._made_from != self._fingerprints():
-            self.depths, self.directions, self.mask = self._measured()
+            # Rays that are kept serve differentiated calls, too.
+            with torch.inference_mode(False), torch.no_grad():
+                self.depths, self.directions, self.mask = self._measured()
             self._made_from = self._fingerprints()
         return self.depths, self.directions, self.mask
 

@@ -47,6 +47,8 @@ class LensParameters(Operations, StatedModule):
         self.field = self.model.network
         parameters = as_points(what, parameters, len(self.names))
         require_finite(what, parameters)
+        if 0 in parameters.shape[:-1]:
+            raise InputError(f"{what}: a batch of at least one is needed, got {tuple(parameters.shape)}")
         self.params = nn.Parameter(parameters.detach().clone(), requires_grad=False)
         free = torch.ones(len(self.names), dtype=torch.bool, device=parameters.device)
         self.register_buffer("free_mask", free)

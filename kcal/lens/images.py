@@ -7,9 +7,10 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from kcal.checks import Float64Module, StatedModule, as_points
+from kcal.checks import Float64Module, StatedModule, as_points, as_tensor
 from kcal.dispatch import is_differentiated, is_traced, may_branch, still
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
@@ -221,8 +222,10 @@ class Undistort(StatedModule):
         # Compiled and exported graphs keep their maps, because comparing values would break the graph. In an eager call
         # the comparison takes some microseconds, and a stale map would give a wrong image.
         if not compiling and (self.grid.dtype != precision or not torch.equal(self._made_from, self._camera_values())):
-            self.grid, self.mask = self._grid(precision)
-            self._made_from = self._camera_values()
+            # Maps that are kept serve differentiated calls, too.
+            with torch.inference_mode(False), torch.no_grad():
+                self.grid, self.mask = self._grid(precision)
+                self._made_from = self._camera_values()
         return self.grid, self.mask
 
     def _pixel_maps(self) -> Tensor:
@@ -449,25 +452,25 @@ class StereoRectification(Float64Module):
         Q[0, 0], Q[1, 1], Q[0, 3], Q[1, 3], Q[2, 3], Q[3, 2] = 1.0, 1.0, -cx, -cy, focal, 1.0 / self._apart[1]
         return Q
 
-    def depth(self, disparity: Tensor) -> Tensor:
+    def depth(self, disparity: Tensor | ArrayLike) -> Tensor:
         """Depth Z along the rectified axis, meters, of disparities in pixels; infinite for 0 and the wrong sign."""
-        disparity = torch.as_tensor(disparity, dtype=torch.float64)
+        disparity = as_disparity(disparity, self.rotation)
         reach = self.camera.params.detach()[0] * self._apart[1]
         ahead = disparity * reach > 0
         return torch.where(ahead, reach / torch.where(ahead, disparity, 1.0), torch.inf)
 
-    def points(self, pixels: Tensor, disparity: Tensor) -> Tensor:
+    def points(self, pixels: Tensor | ArrayLike, disparity: Tensor | ArrayLike) -> Tensor:
         """Points (..., N, 3) in the rig's frame, meters, of left rectified pixels (..., N, 2) and disparities (..., N).
 
         Entrance pupils are taken to stand still; `kcal.locate.DisparityRanges` takes the lenses as they are.
         """
-        pixels = as_points("pixels", pixels, 2)
+        pixels = as_points("pixels", pixels, 2, self.rotation)
         focal, center = self.camera.params.detach()[0], self.camera.params.detach()[2:4]
         plane = (pixels - center) / focal
         ahead = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
         return self.depth(disparity)[..., None] * ahead @ self.rotation.mT
 
-    def source_pixels(self, pixels: Tensor, disparity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def source_pixels(self, pixels: Tensor | ArrayLike, disparity: Tensor | ArrayLike) -> tuple[Tensor, Tensor, Tensor]:
         """Where rectified pixels lie in the images as taken.
 
         Args:
@@ -477,13 +480,28 @@ class StereoRectification(Float64Module):
         Returns:
             left and right (..., N, 2), and valid (..., N).
         """
-        pixels = as_points("pixels", pixels, 2)
-        moved = pixels - disparity[..., None] * self._apart[0]
+        pixels = as_points("pixels", pixels, 2, self.rotation)
+        moved = pixels - as_disparity(disparity, self.rotation)[..., None] * self._apart[0]
         found = []
         for module, where in ((self.left, pixels), (self.right, moved)):
             rays, _ = self.camera.unproject(where)
             found.append(TurnedCamera(module.camera, module.rotation, module.at).project_rays(rays))
         return found[0][0], found[1][0], found[0][1] & found[1][1]
+
+
+def as_disparity(disparity: Tensor | ArrayLike, like: Tensor) -> Tensor:
+    """Disparities (...) as float64 on the device of `like`.
+
+    Raises:
+        InputError: not floating point, or less than float32.
+    """
+    given = as_tensor("disparity", disparity)
+    if not given.is_floating_point():
+        raise InputError(
+            "disparity: floating point is needed, got whole numbers; those of cv2.StereoSGBM are sixteenths of a "
+            "pixel: divide them by 16.0"
+        )
+    return as_points("disparity", (given if given is disparity else given.to(like.device))[..., None], 1, like)[..., 0]
 
 
 def _rectified_frame(rig: Rig) -> Tensor:

@@ -6,11 +6,12 @@ import math
 from typing import NamedTuple
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
-from kcal.checks import Float64Module, as_tensor, exportable, scalar
+from kcal.checks import Float64Module, as_points, exportable, scalar
 from kcal.errors import InputError
-from kcal.lens.images import StereoRectification
+from kcal.lens.images import StereoRectification, as_disparity
 from kcal.locate.localizer import Localizer
 from kcal.texts import briefly
 
@@ -77,27 +78,26 @@ class DisparityRanges(Float64Module):
         self.localize = Localizer(rectification.rig, weights="marks")
 
     @torch.no_grad()
-    def forward(self, disparity: Tensor) -> RangeImage:
+    def forward(self, disparity: Tensor | ArrayLike) -> RangeImage:
         """Map disparities (..., H, W) in pixels of the left rectified image; NaN and the wrong sign have no range.
 
         Raises:
             InputError: not floating point, or another size.
         """
         width, height = self.rectification.camera.size
-        disparity = as_tensor("disparity", disparity)
-        if not disparity.is_floating_point() or tuple(disparity.shape[-2:]) != (height, width):
-            raise InputError(
-                f"disparity: floating point (..., {height}, {width}) is needed, got {disparity.dtype} "
-                f"{tuple(disparity.shape)}"
-            )
+        disparity = as_disparity(disparity, self.disparity_sigma)
+        if tuple(disparity.shape[-2:]) != (height, width):
+            raise InputError(f"disparity: shape (..., {height}, {width}) is needed, got {tuple(disparity.shape)}")
         pixels = self.rectification.camera.grid(width, height).expand(*disparity.shape, 2).reshape(-1, 2)
-        flat = disparity.double().reshape(-1)
+        flat = disparity.reshape(-1)
         pieces = [self.at(*piece) for piece in zip(pixels.split(_PIECE), flat.split(_PIECE), strict=True)]
         return RangeImage(*(torch.cat(parts).reshape(disparity.shape) for parts in zip(*pieces, strict=True)))
 
     @torch.no_grad()
-    def at(self, pixels: Tensor, disparity: Tensor) -> RangeImage:
+    def at(self, pixels: Tensor | ArrayLike, disparity: Tensor | ArrayLike) -> RangeImage:
         """The same for single pixels (N, 2) of the left rectified image and their disparities (N,)."""
+        disparity = as_disparity(disparity, self.disparity_sigma)
+        pixels = as_points("pixels", pixels, 2, disparity)
         good = self.rectification.depth(disparity).isfinite() & disparity.isfinite()
         safe = torch.where(good, disparity, 1.0)
         left, right, seen = self.rectification.source_pixels(pixels, safe)

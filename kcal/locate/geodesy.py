@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from kcal.checks import as_points, require_finite
@@ -196,7 +197,7 @@ def place_enu(enu: Tensor, ecef_from_enu: Tensor, ecef_of_origin: Tensor) -> Ten
     return torch.stack([lat, torch.where(lon >= 180.0, lon - 360.0, lon), height], -1)
 
 
-def geodetic_to_enu(geodetic: Tensor, origin: Origin) -> Tensor:
+def geodetic_to_enu(geodetic: Tensor | ArrayLike, origin: Origin) -> Tensor:
     """ENU meters of (..., 3) latitude, longitude (degrees), ellipsoidal WGS84 height (meters); differentiable.
 
     Raises:
@@ -210,8 +211,8 @@ def geodetic_to_enu(geodetic: Tensor, origin: Origin) -> Tensor:
         [[0.0, 0.0, 10.0]]
     """
     checked = as_points("geodetic", geodetic, 3)
-    if geodetic.dtype != torch.float64:
-        raise InputError(f"geodetic: float64 is needed; {geodetic.dtype} has already rounded degrees by up to a meter")
+    if str(getattr(geodetic, "dtype", "")).endswith("float32"):
+        raise InputError("geodetic: float64 is needed; float32 has already rounded degrees by up to a meter")
     require_finite("geodetic", checked)
     if bool((checked[..., 0].abs() > 90).any()):
         raise InputError("geodetic: a latitude is outside -90 to 90; the order is latitude, longitude, height")

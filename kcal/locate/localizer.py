@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self, TypeAlias, get_args
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -321,7 +322,7 @@ class Localizer(Operations, Movable, StatedModule):
                 has no place on the Earth.
         """
         count, like = len(self.rig), self.rig.translation
-        if other is not None and not (isinstance(other, Tensor) and other.dtype == torch.bool):
+        if other is not None and not _is_bool(other):
             if count != 2:
                 raise InputError(
                     f"seen: bool is needed; left and right are pixels of two cameras, and this rig has {count}"
@@ -558,6 +559,10 @@ class Localizer(Operations, Movable, StatedModule):
         pairs = stereo.checked_pairs(pixels_left, pixels_right, self._two)
         found = viewing.fit_pairs(self.rig, *pairs, noise=self.pixel_sigma, by_camera=by_camera)
         return self._by_marks(found), _sensitivity(found)
+
+
+def _is_bool(values: Tensor | ArrayLike) -> bool:
+    return values.dtype == torch.bool if isinstance(values, Tensor) else np.asarray(values).dtype == bool
 
 
 def _sensitivity(found: viewing.ViewsFit) -> Sensitivity:

@@ -124,7 +124,7 @@ def checked_covariance(
     return expanded("cov", cov, (*lead, *each))
 
 
-def checked_mask(mask: Tensor, shape: tuple[int, ...], device: torch.device, name: str = "mask") -> Tensor:
+def checked_mask(mask: Tensor | ArrayLike, shape: tuple[int, ...], device: torch.device, name: str = "mask") -> Tensor:
     """A mask of bool, broadcast to a shape."""
     mask = torch.as_tensor(mask, device=device)
     if mask.dtype != torch.bool:
@@ -132,11 +132,13 @@ def checked_mask(mask: Tensor, shape: tuple[int, ...], device: torch.device, nam
     return expanded(name, mask, shape)
 
 
-def checked_views(pixels: Tensor | ArrayLike, seen: Tensor | None, count: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels as float64 (..., V, 2) and which of them are seen, after checking types and shapes."""
+def checked_views(
+    pixels: Tensor | ArrayLike, seen: Tensor | ArrayLike | None, count: int, like: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Pixels as float64 (..., N, V, 2) and which of them are seen, after checking types and shapes."""
     pixels = as_points("pixels", pixels, 2, like)
-    if pixels.ndim < 2 or pixels.shape[-2] != count:
-        raise InputError(f"pixels: shape (..., {count}, 2) is needed, got {tuple(pixels.shape)}")
+    if pixels.ndim < 3 or pixels.shape[-2] != count:
+        raise InputError(f"pixels: shape (..., N, {count}, 2) is needed, got {tuple(pixels.shape)}")
     if seen is None:
         return pixels, torch.ones(pixels.shape[:-1], dtype=torch.bool, device=pixels.device)
     return pixels, checked_mask(seen, pixels.shape[:-1], pixels.device, "seen")

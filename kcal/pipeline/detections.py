@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import orjson
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from kcal.checks import as_points, require_finite
@@ -84,6 +84,15 @@ def _optional(values: Any, name: str) -> Tensor | None:
     return None if values is None else _as_numbers(name, values)
 
 
+def _found_keypoints(values: Any) -> Tensor | None:
+    """(N, K, 2): those at (0, 0) were not found, as in COCO, and are NaN."""
+    points = _optional(values, "keypoints")
+    if points is None or not len(points):
+        return None
+    points = points[..., :2]
+    return torch.where((points == 0).all(-1, keepdim=True), torch.nan, points)
+
+
 def _plain_list(values: Any) -> list | None:
     return None if values is None else [value.item() if hasattr(value, "item") else value for value in values]
 
@@ -105,13 +114,12 @@ def _from_dict(source: Mapping[str, Any]) -> Raw:
     """Of torchvision; `labels` may be names."""
     if "boxes" not in source:
         raise InputError(f"detections: the dictionary has no boxes, only {', '.join(map(str, source))}")
-    keypoints = _optional(source.get("keypoints"), "keypoints")
     return dict(
         boxes=_boxes(source["boxes"]),
         score=_optional(source.get("scores"), "scores"),
         category=_plain_list(source.get("labels")),
         track=_plain_list(source.get("tracks")),
-        keypoints=None if keypoints is None or not len(keypoints) else keypoints[..., :2],
+        keypoints=_found_keypoints(source.get("keypoints")),
         masks=None if source.get("masks") is None else torch.as_tensor(source["masks"]),
     )
 
@@ -169,7 +177,7 @@ def _from_ultralytics(source: Any) -> Raw:
         score=_optional(boxes.conf, "conf"),
         category=_plain_list(boxes.cls),
         track=None if tracks is None else [int(i) for i in tracks],
-        keypoints=None if keypoints is None else _as_numbers("keypoints", keypoints.xy),
+        keypoints=None if keypoints is None else _found_keypoints(keypoints.xy),
         # Others are in the letterboxed input: to be read with retina_masks=True.
         masks=whole if whole is not None and tuple(whole.shape[1:]) == (height, width) else None,
         size=(int(width), int(height)),
@@ -286,7 +294,8 @@ class Detections:
             source: `Detections` of supervision, a dictionary of torchvision (`boxes`, `labels`, `scores`, `masks`,
                 `keypoints`), one `Results` of ultralytics or what has its attributes (masks with `retina_masks=True`
                 only), `Boxes` or `Keypoints` of kornia, an array or tensor (N, 4) to (N, 6) of x1, y1, x2, y2, score,
-                class, or a line of JSON (see `kcal.pipeline.detections`).
+                class, or a line of JSON (see `kcal.pipeline.detections`). Keypoints at (0, 0) of a dictionary or of
+                ultralytics were not found.
             size: (width, height) of the image, where the source does not say.
             time: seconds at which the image was exposed, where the source does not say.
             names: of classes, where the source has numbers only.
@@ -335,9 +344,15 @@ class Detections:
         """The same on another device, in the same graph."""
         return dataclasses.replace(self, **self._each(lambda value: value.to(device)))
 
-    def select(self, chosen: Tensor) -> Detections:
+    def select(self, chosen: Tensor | ArrayLike) -> Detections:
         """Those that a mask (N,) or a list of numbers chooses."""
-        numbers = chosen.nonzero()[:, 0] if chosen.dtype == torch.bool else chosen
+        numbers = torch.as_tensor(chosen, device=self.boxes.device)
+        if numbers.dtype == torch.bool and len(numbers) == len(self):
+            numbers = numbers.nonzero()[:, 0]
+        elif len(numbers) and numbers.dtype not in (torch.int64, torch.int32):
+            # A mask of uint8 would choose other categories than boxes.
+            raise InputError(f"select: a mask of {len(self)} bool or whole numbers are needed, got {numbers}")
+        numbers = numbers.long()
         category = tuple(self.category[i] for i in numbers.tolist())
         track = tuple(self.track[i] for i in numbers.tolist())
         return dataclasses.replace(self, **self._each(lambda value: value[numbers]), category=category, track=track)

@@ -194,6 +194,7 @@ class TestRefusals:
             (torch.ones(10, dtype=torch.int64), "floating point"),
             (torch.full((10,), float("nan")), "10 of 10 values are not finite"),
             (torch.zeros(10), "focal lengths must be positive"),
+            (torch.zeros(0, 10), r"at least one is needed, got \(0, 10\)"),
             (-torch.ones(10), "focal lengths must be positive"),
         ],
     )

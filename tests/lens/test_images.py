@@ -16,7 +16,7 @@ from lenses import NAMED, camera_of
 from torch import Tensor
 
 from kcal import Camera, InputError
-from kcal.lens import CameraCalibration, ImageTransform, Undistort, undistort_maps
+from kcal.lens import CameraCalibration, CameraRays, ImageTransform, Undistort, undistort_maps
 from kcal.lens.camera_like import project_each, stackable, unproject_each
 from kcal.lens.projection import project_components
 from kcal.lens.views import new_pinhole, source_pixels
@@ -201,6 +201,19 @@ class TestModule:
         assert sorted(undistort.state_dict()) == sorted(
             ["_extra_state", *(f"{which}.{name}" for which in ("camera", "new_camera") for name in LITTLE.state_dict())]
         )
+
+    def test_what_inference_mode_kept_can_be_trained_through(self) -> None:
+        camera = copy.deepcopy(LITTLE)
+        undistort, rays = Undistort(camera), CameraRays(camera)
+        with torch.no_grad():
+            camera.params[0] += 1.0
+        image, pose = torch.rand(1, 120, 160), torch.eye(4)[None]
+        with torch.inference_mode():
+            undistort(image), rays(pose)
+        for module, given in ((undistort, image), (rays, pose)):
+            found = module(given.requires_grad_())
+            (found[0] if isinstance(found, tuple) else found).sum().backward()
+            assert bool(given.grad.any())
 
     @pytest.mark.parametrize(
         ("image", "message"),

@@ -5,7 +5,9 @@ from __future__ import annotations
 import datetime
 import json
 import math
+from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from locate_rigs import located_pairs, pinhole_rig, real_rig, spread_points, tensor
@@ -72,6 +74,21 @@ class TestDisparities:
         for sigma in (0.0, math.inf, math.nan):
             with pytest.raises(InputError, match="disparity_sigma"):
                 DisparityRanges(rectify, disparity_sigma=sigma)
+
+    def test_arrays_and_sixteenths_of_a_pixel(self) -> None:
+        """cv2.StereoSGBM returns int16, 16 times the disparity: ranges would be 16 times too small."""
+        rectify = StereoRectification(RIG, size=(32, 18))
+        ranges, pixels, found = DisparityRanges(rectify), np.array([[16.0, 9.0]]), np.array([4], np.int16)
+        of_pixels = (partial(call, pixels) for call in (rectify.points, rectify.source_pixels, ranges.at))
+        for call in (rectify.depth, *of_pixels):
+            with pytest.raises(InputError, match="sixteenths of a pixel"):
+                call(found)
+            call(found / 16.0)
+        expected = ranges.at(tensor([16.0, 9.0]), tensor(0.25)).range
+        assert torch.equal(ranges.at([[16.0, 9.0]], [0.25]).range, expected)
+        assert torch.equal(ranges.at(pixels, found / 16.0).range, expected)
+        with pytest.raises(InputError, match="float16"):
+            rectify.depth(torch.tensor([16.0]).half())
 
 
 def test_errors_against_a_truth() -> None:

@@ -162,10 +162,13 @@ def test_shapes_and_bad_points() -> None:
     assert enu_to_geodetic(torch.zeros(2, 4, 3), origin).shape == (2, 4, 3)
     assert enu_to_geodetic(torch.zeros(3), origin).tolist() == pytest.approx([19.07, 72.87, 14.0], abs=1e-8)
     assert enu_to_geodetic(torch.zeros(0, 3), origin).shape == (0, 3)
+    for place in ([[19.07, 72.87, 24.0]], np.array([[19.07, 72.87, 24.0]])):
+        assert torch.equal(geodetic_to_enu(place, origin), geodetic_to_enu(tensor(place[0]), origin))
     with pytest.raises(InputError, match="not finite"):
         enu_to_geodetic(tensor([0.0, math.nan, 0.0]), origin)
-    with pytest.raises(InputError, match="float64"):
-        geodetic_to_enu(torch.tensor([[19.07, 72.87, 14.0]]), origin)
+    for rounded in (torch.tensor([[19.07, 72.87, 14.0]]), np.array([[19.07, 72.87, 14.0]], np.float32)):
+        with pytest.raises(InputError, match="float64"):
+            geodetic_to_enu(rounded, origin)
     with pytest.raises(InputError, match="latitude, longitude, height"):
         geodetic_to_enu(tensor([[151.2, -33.9, 14.0]])[0], origin)
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from locate_rigs import SIZE, pinhole_rig, real_rig, spread_points, standing, tensor, turned
@@ -302,12 +303,18 @@ def test_sensitivities() -> None:
     assert moved.abs().tolist() == pytest.approx([4.3633, 0.17453], rel=2e-3)
 
 
+def test_what_was_seen_may_be_an_array() -> None:
+    pixels, seen = tensor([980.0, 540.0], [960.0, 540.0]).expand(2, 2, 2), np.array([[True, True], [True, False]])
+    assert localizer()(pixels.numpy(), seen).status.tolist() == [PositionStatus.OK, PositionStatus.MASKED]
+
+
 def test_bad_arguments() -> None:
     module, marks = localizer(), tensor([980.0, 540.0])
     for arguments, message in (
         ((marks.long(), marks), "floating point"),
         ((marks, marks[0]), "same shape"),
         ((marks[0], marks[0]), "same shape"),
+        ((torch.stack([marks[0], marks[0]]),), r"\(\.\.\., N, 2, 2\) is needed, got \(2, 2\)"),
         ((marks, marks, torch.eye(2).double()), "cov"),
         ((marks, marks, None, torch.ones(1)), "bool"),
     ):

@@ -217,7 +217,7 @@ def test_errors_of_clocks_widen_along_the_motion() -> None:
 
 def test_bad_arguments() -> None:
     rig = ring(3, 3000.0)
-    with pytest.raises(InputError, match=r"shape \(\.\.\., 3, 2\)"):
+    with pytest.raises(InputError, match=r"shape \(\.\.\., N, 3, 2\)"):
         Localizer(rig)(torch.zeros(4, 2, 2))
     with pytest.raises(InputError, match="seen: bool"):
         Localizer(rig)(torch.zeros(4, 3, 2), torch.ones(4, 3))

@@ -86,6 +86,19 @@ def test_ultralytics() -> None:
     assert Detections.read(results(masks=types.SimpleNamespace(data=torch.ones(2, 64, 64)))).masks is None
 
 
+def test_keypoints_at_the_corner_were_not_found() -> None:
+    """Ultralytics sets points below a confidence of 0.5 to (0, 0), as COCO has those without a label."""
+    points = torch.full((2, 3, 3), 8.0)
+    points[0, 1] = 0.0
+    for source in (
+        results(keypoints=types.SimpleNamespace(xy=points[..., :2])),
+        {"boxes": EDGES, "keypoints": points},
+    ):
+        found = Detections.read(source, size=SIZE)
+        assert found.anchors(1).isnan().all(-1).tolist() == [True, False]
+        assert found.anchors(0).tolist() == [[7.5, 7.5]] * 2
+
+
 def test_kornia() -> None:
     boxes = kornia.geometry.boxes.Boxes.from_tensor(torch.tensor(EDGES), mode="xyxy")
     assert torch.equal(Detections.read(boxes, size=SIZE).boxes, CENTERS)
@@ -138,6 +151,12 @@ def test_selection() -> None:
     found = Detections.read(np.column_stack([EDGES, [0.9, 0.5], [1, 2]]), size=SIZE)
     assert found.select(found.score > 0.6).category == ("1",)
     assert torch.equal(found.select(torch.tensor([1, 0])).boxes, CENTERS.flip(0))
+    assert found.select([1]).category == ("2",)
+    assert len(found.select([])) == 0
+    assert found.select(np.array([True, True])).category == ("1", "2")
+    for wrong in (torch.ones(2, dtype=torch.uint8), torch.tensor([True]), torch.ones(2)):
+        with pytest.raises(InputError, match="a mask of 2 bool or whole numbers"):
+            found.select(wrong)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import CoefficientPrior, GaussianPrior, Term, is_overparameterized
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import Views, noise_variance, uncertainty_of
-from kcal.checks import StatedModule, as_points, require_finite
+from kcal.checks import StatedModule, as_points, as_tensor, require_finite
 from kcal.dispatch import is_differentiated
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
@@ -229,7 +229,7 @@ def calibrate_views(
     """
     options = options or CalibrationOptions()
     checked = _checked(pixels, board_points, options, mask, prior_means, corner_sigma, backward)
-    device, (pixels, board_points, means) = pixels.device, (tensor.cpu() for tensor in checked)
+    device, (pixels, board_points, means) = checked[0].device, (tensor.cpu() for tensor in checked)
     if start is not None and (start.hybrid is not None) != options.hybrid:
         raise InputError("calibrate_views: the start is of another lens model")
     fit: HybridFit | None = None
@@ -420,6 +420,7 @@ def _checked(
         )
     require_finite("board_points", board_points)
     if mask is not None:
+        mask = torch.as_tensor(mask)
         if mask.shape != pixels.shape[:-1] or mask.dtype != torch.bool:
             raise InputError(f"calibrate_views: the mask must be bool {tuple(pixels.shape[:-1])}")
         if not bool(torch.isfinite(pixels[mask]).all()):
@@ -427,7 +428,8 @@ def _checked(
         pixels = torch.where(mask[..., None], pixels, torch.nan)
     if prior_means is None:
         prior_means = pixels.new_tensor([mean for mean, _ in options.priors.values()])
-    elif prior_means.shape != (len(options.priors),):
+    prior_means = as_tensor("prior_means", prior_means)
+    if prior_means.shape != (len(options.priors),):
         raise InputError(
             f"calibrate_views: {len(options.priors)} prior means are needed, got shape {tuple(prior_means.shape)}"
         )

@@ -297,6 +297,14 @@ class TestRefusals:
             calibrate_views(**arguments)  # type: ignore[arg-type]
 
 
+def test_arrays_and_lists_are_taken() -> None:
+    options = CalibrationOptions(model="opencv4", priors=PRIORS)
+    seen, means = torch.ones(CORNERS.shape[:2], dtype=torch.bool), torch.tensor([498.0, 236.0])
+    found = calibrate_views(CORNERS, BOARD.points, SIZE, options, mask=seen, prior_means=means).parameters
+    again = CalibrationLayer(SIZE, options)(CORNERS.tolist(), BOARD.points.numpy(), seen.numpy(), means.tolist())
+    assert torch.equal(again.parameters, found)
+
+
 def test_float32_corners_are_promoted() -> None:
     corners = CORNERS.float().requires_grad_(True)
     found = CalibrationLayer(SIZE, CalibrationOptions(model="opencv4")).half()(corners, BOARD.points.float())
