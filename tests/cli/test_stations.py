@@ -437,7 +437,7 @@ def test_one_pixel_and_two_are_located(names: tuple[str, str], known: Path, comm
 )
 def test_what_is_missing_of_a_pose_is_asked_for(words: str, message: str, known: Path, command: Command) -> None:
     Path("short.csv").write_text("".join(POSES.splitlines(keepends=True)[:2]))
-    Path("turned.csv").write_text(POSES.replace("46.4,7.5", "7.5,46.4"))
+    Path("turned.csv").write_text(POSES.replace("46.4,7.5", "7.4,46.4"))
     Path("bare.csv").write_text(POSES.replace("5,0.05,2", "5,,2"))
     assert message in command(f"place west.camera.json {words} -o rig.json", code=1).err.replace("\n", " ")
     assert not Path("rig.json").exists()

@@ -68,7 +68,7 @@ def without_rayless(data: RigData) -> tuple[RigData, list[Finding]]:
                 width, height = camera.size
                 raise InputError(
                     f"{kind}: {outside} of {count} pixels lie outside the image of {data.names[c]}, {width}x{height} "
-                    "px: marked in images of another size? Those of the size that the camera was calibrated at are needed"
+                    "px: marked in images of another size? Those of the size at which it was calibrated are needed"
                 )
             _, valid = camera.unproject(pixels[:, c])
             lost = seen & ~valid
