@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 import yaml
 from torch import Tensor
@@ -284,6 +285,9 @@ def flat(value: Any) -> list[float] | None:
     """All numbers of a scalar, of nested lists, of an array or of a block with `data`; None for anything else."""
     if isinstance(value, Mapping):
         return flat(value["data"]) if "data" in value else None
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        # At once: maps for cv2.remap have millions.
+        return None if value.dtype == bool else list(value.astype(float).ravel().tolist())
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, list | tuple):

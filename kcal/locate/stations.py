@@ -17,7 +17,7 @@ from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Mounting, Origin, Rig
 from kcal.locate.geodesy import ecef_from_enu_rotation, geodetic_to_enu
 from kcal.locate.localizer import Localizer
 from kcal.locate.mounting import attitude, station_mounting
-from kcal.locate.survey import EARTH, place_sigma
+from kcal.locate.survey import EARTH, place_sigma, refuse_exchanged
 from kcal.locate.tables import TableRow, read_rows
 
 
@@ -123,6 +123,8 @@ def read_stands(path: str | Path, names: Sequence[str] | None = None) -> dict[st
         FileError: see `kcal.locate.tables.read_rows`; a value out of range, no sigma, or a camera without a line.
     """
     rows = {row.name: row for row in read_rows(path, _STAND_HEADER, _STAND_COLUMNS, _STAND_HEADER.split(",")[1:])}
+    degrees = [[row.number(column, "decimal degrees") for column in EARTH[:2]] for row in rows.values()]
+    refuse_exchanged([*rows.values()], torch.tensor(degrees, dtype=torch.float64))
     found = {}
     for name in rows if names is None else names:
         if name not in rows:

@@ -126,7 +126,7 @@ def places_of(rows: Sequence[TableRow], path: str | Path, origin: Origin | None)
                 raise FileError(text)
             warnings.warn(f"{text}; in a frame of your own they are flat and to the grid's scale", KcalWarning, 2)
         return values, origin
-    _refuse_exchanged(rows, values)
+    refuse_exchanged(rows, values)
     for row, (lat, lon, height) in zip(rows, values.tolist(), strict=True):
         try:
             place = Origin(lat=lat, lon=lon, height=height)
@@ -138,7 +138,7 @@ def places_of(rows: Sequence[TableRow], path: str | Path, origin: Origin | None)
     return geodetic_to_enu(values, origin), origin
 
 
-def _refuse_exchanged(rows: Sequence[TableRow], values: Tensor) -> None:
+def refuse_exchanged(rows: Sequence[TableRow], values: Tensor) -> None:
     """Raise `FileError` for lines that lie among the others once latitude and longitude are exchanged."""
     places = values[:, :2]
     middle = places.median(0).values
@@ -375,7 +375,8 @@ def _spread(place: _Place, sigma: float | None, path: Path) -> tuple[float, floa
 
 
 def _from_geojson(content: Any) -> list[_Place]:
-    if content.get("crs"):
+    # GDAL and QGIS name the system that RFC 7946 prescribes.
+    if (crs := content.get("crs")) and "CRS84" not in str(crs):
         raise ValueError("it has a member crs; RFC 7946 allows WGS84 longitude and latitude only")
     places = []
     for number, feature in enumerate(content["features"], 1):

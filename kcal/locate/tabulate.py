@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +19,7 @@ from pyproj.exceptions import ProjError
 from torch import Tensor
 
 from kcal.checks import as_points
-from kcal.errors import FileError, InputError
+from kcal.errors import FileError, InputError, KcalWarning
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Origin
 from kcal.locate.geodesy import azimuth_elevation
@@ -104,6 +105,8 @@ def true_from_grid(grid_heading_deg: float, origin: Origin, crs: str) -> float:
         origin: where it was measured.
         crs: the map's projected coordinate system, for example `"EPSG:32643"` (UTM zone 43 north).
 
+    Outside the area that the system is made for, such as another zone of UTM, a `KcalWarning` says how it is turned.
+
     Raises:
         InputError: not a projected coordinate system, or the place lies outside of it.
 
@@ -123,7 +126,19 @@ def true_from_grid(grid_heading_deg: float, origin: Origin, crs: str) -> float:
         grid_north = pyproj.Proj(system).get_factors(origin.lon, origin.lat, errcheck=True).meridian_convergence
     except ProjError as error:
         raise InputError(f"{crs}: {system.name} does not reach {origin.lat:g}, {origin.lon:g}") from error
-    return float(grid_heading_deg + grid_north)
+    # Areas may contain the antimeridian, or all longitudes.
+    if (area := system.area_of_use) and not (
+        area.south <= origin.lat <= area.north
+        and (origin.lon - area.west) % 360 <= ((area.east - area.west) % 360 or 360)
+    ):
+        warnings.warn(
+            f"{crs}: {system.name} is made for latitudes {area.south:g} to {area.north:g} and longitudes {area.west:g} "
+            f"to {area.east:g}, not for {origin.lat:g}, {origin.lon:g}, where its grid north is {grid_north:.2f}° from "
+            "true north: is it this map's?",
+            KcalWarning,
+            stacklevel=2,
+        )
+    return math.fmod(grid_heading_deg + grid_north, 360.0)
 
 
 # Circular error probable of positions whose error ellipse is long, and skewed along the line of sight.

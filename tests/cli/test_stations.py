@@ -431,11 +431,13 @@ def test_one_pixel_and_two_are_located(names: tuple[str, str], known: Path, comm
         ),
         ("--site 46,7,1500 --heading 62±1 --pitch 95±1", "pitch 95"),
         ("east.camera.json --places short.csv", "no line is named 'east'"),
+        ("east.camera.json --places turned.csv", "line 3: latitude and longitude are exchanged (east)"),
         ("--places bare.csv", "pitch_sigma is empty; write how well it is known, degrees"),
     ],
 )
 def test_what_is_missing_of_a_pose_is_asked_for(words: str, message: str, known: Path, command: Command) -> None:
     Path("short.csv").write_text("".join(POSES.splitlines(keepends=True)[:2]))
+    Path("turned.csv").write_text(POSES.replace("46.4,7.5", "7.4,46.4"))
     Path("bare.csv").write_text(POSES.replace("5,0.05,2", "5,,2"))
     assert message in command(f"place west.camera.json {words} -o rig.json", code=1).err.replace("\n", " ")
     assert not Path("rig.json").exists()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import time
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from opencv_files import file_storage
 from scipy.io import savemat
 
 from kcal.errors import FileError, InputError
+from kcal.io.foreign import flat
 from kcal.io.formats import FORMATS, import_cameras, recognized
 
 ROS = """image_width: 640
@@ -246,3 +248,10 @@ def test_every_format_is_recognized_without_its_name(tmp_path: Path) -> None:
     assert set(FORMATS) == {"opencv", "ros", "kalibr", "mrcal", "colmap", "nerfstudio", "matlab", "opensfm", "toml",
                             "qualisys", "agisoft", "bag", "device", "gtsam", "ceres", "numpy", "basalt", "multical",
                             "calibio"}  # fmt: skip
+
+
+def test_maps_in_a_file_cost_little_time() -> None:
+    start = time.process_time()
+    assert flat(np.ones((1080, 1920))) == [1.0] * (1080 * 1920)
+    assert flat(np.ones((1080, 1920), bool)) is None
+    assert time.process_time() - start < 0.7

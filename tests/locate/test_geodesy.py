@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from locate_rigs import tensor
 
-from kcal import FileError, InputError, Origin
+from kcal import FileError, InputError, KcalWarning, Origin
 from kcal.lens import save_onnx
 from kcal.lens.pose import enu_from_cam
 from kcal.locate.geodesy import (
@@ -268,6 +268,13 @@ def test_grid_north_is_not_true_north() -> None:
     (e0, n0), (e1, n1) = project(72.87, 19.07), project(72.87, 19.0701)
     assert (e1 - e0) / (n1 - n0) == pytest.approx(0.01215, abs=1e-5)
     assert true_from_grid(12.0, Origin(lat=19.07, lon=75.0, height=0.0), "EPSG:32643") == pytest.approx(12.0, abs=1e-9)
+    east = Origin(lat=19.07, lon=77.0, height=0.0)
+    assert true_from_grid(359.9, east, "EPSG:32643") == pytest.approx(0.553, abs=1e-3)
+    with pytest.warns(KcalWarning, match=r"longitudes 78 to 84, not for 19.07, 72.87, .* -2.67° from true north"):
+        assert true_from_grid(90.0, mumbai, "EPSG:32644") == pytest.approx(87.335, abs=0.01)
+    # Areas may contain the antimeridian, or all longitudes.
+    for crs, lon in (("EPSG:3832", -170.0), ("EPSG:3395", 72.0)):
+        true_from_grid(90.0, Origin(lat=0.0, lon=lon, height=0.0), crs)
 
 
 @pytest.mark.parametrize(("crs", "message"), [("EPSG:4326", "has no grid"), ("nonsense", "does not know")])

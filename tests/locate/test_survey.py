@@ -191,6 +191,12 @@ def test_three_formats_of_the_same_places(tmp_path: Path) -> None:
         assert found.sigma.tolist() == expected.sigma.tolist()
 
 
+def test_geojson_of_gdal_names_its_system(tmp_path: Path) -> None:
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
+    text = collection(feature("post", 72.87, 19.07, 14.0, sigma=1), crs=crs)
+    assert import_survey(write(tmp_path, text, "a.geojson")).origin == Origin(lat=19.07, lon=72.87, height=14.0)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "what"),
     [

@@ -48,12 +48,15 @@ from kcal.threads import in_one_thread
 
 # Leave out marks and corners at which a lens model has no ray.
 
+# The share of pixels outside an image beyond which they are of an image of another size, not single slips.
+_MOST_OUTSIDE = 0.1
+
 
 def without_rayless(data: RigData) -> tuple[RigData, list[Finding]]:
     """The data with pixels at which a lens model has no ray taken as unseen, and doubts that count them.
 
     Raises:
-        InputError: most corners of a board are such pixels.
+        InputError: most corners of a board are such pixels; many pixels lie outside their image.
     """
     doubts, changed = list[Finding](), dict[str, Any]()
     for source in data.seen:
@@ -61,6 +64,13 @@ def without_rayless(data: RigData) -> tuple[RigData, list[Finding]]:
         pixels = source.pixels.clone()
         for c, camera in enumerate(data.cameras):
             seen = torch.isfinite(pixels[:, c]).all(-1)
+            outside, count = int((seen & ~camera.inside(pixels[:, c])).sum()), int(seen.sum())
+            if outside > max(1.0, _MOST_OUTSIDE * count):
+                width, height = camera.size
+                raise InputError(
+                    f"{kind}: {outside} of {count} pixels lie outside the image of {data.names[c]}, {width}x{height} "
+                    "px: marked in images of another size? Those of the size at which it was calibrated are needed"
+                )
             _, valid = camera.unproject(pixels[:, c])
             lost = seen & ~valid
             if not bool(lost.any()):

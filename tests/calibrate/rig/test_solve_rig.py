@@ -560,6 +560,8 @@ class TestInput:
         lost = [text for text in found.warnings if "no ray" in text] or [item.name for item in found.left_out]
         assert lost
         assert bool((pose_error(found).abs() < 4.5 * found.relative_covariance().diagonal().sqrt()).all())
+        with pytest.raises(InputError, match=r"\d+ of 12 pixels lie outside the image of .*images of another size"):
+            solve_rig(data(landmarks=dataclasses.replace(marks, pixels=2.0 * marks.pixels)))
 
 
 def test_a_lens_that_changed_since_its_calibration() -> None:
