@@ -205,7 +205,10 @@ class Drift:
         chi2: of the relative turn: with three degrees of freedom, if there was none.
         old: the rig as it was solved.
         rig: the rig as it stands now: the same cameras in the same places, turned.
-        pose_covariance: (6, 6) what the measurement adds to the covariance of the rig's relative pose.
+        root: (K, P) what was not known of the rig, and is not known of it as it stands now, as `Rig.relative_root`;
+            None: nothing.
+        pose_covariance: (6, 6) what the measurement adds for the relative pose.
+        attitude_covariance: (3, 3) what it adds for the left camera's attitude, about its own axes; None as above.
         cam_from_local: (3, 3) of the left camera now, where a pose was given.
         items: residuals by item, those left out included: what moved, or is not the same point.
         variance: by which covariances were multiplied, because residuals were larger than stated.
@@ -222,7 +225,9 @@ class Drift:
     chi2: float
     old: Rig
     rig: Rig
+    root: Tensor | None
     pose_covariance: Tensor
+    attitude_covariance: Tensor | None
     cam_from_local: Tensor | None
     items: tuple[ItemResidual, ...]
     variance: float
@@ -290,8 +295,8 @@ class Drift:
     def relocked(self, note: str) -> Rig:
         """The old rig with the present attitudes; cameras and their places stay.
 
-        The covariance of the drift is added to that of the rig and its mounting: the errors of the first solution are
-        still in it, and those of the check come on top. What counted as exact has the latter alone.
+        The errors of the first solution are still in it, but for those of attitudes that landmarks tell anew; those of
+        the check come on top. What counted as exact has the latter alone.
 
         Args:
             note: when and from what, for the record.
@@ -304,16 +309,18 @@ class Drift:
         """
         rig = self.old
         new = Rig.pair(rig.left, rig.right, self.rig.right_from_left_rotation, self.rig.right_from_left_translation)
-        known, stands, pad = rig.relative_root, rig.mounting, torch.nn.functional.pad
+        stands, pad = rig.mounting, torch.nn.functional.pad
         more = [pad(half_of_covariance(self.pose_covariance), (rig.quantities - 13, 7))]
-        if stands is not None and self.cam_from_local is not None and self.left_covariance is not None:
+        if stands is not None and self.cam_from_local is not None and self.attitude_covariance is not None:
             heading, pitch, roll = attitude(self.cam_from_local.T)
             stands = dataclasses.replace(stands, heading_deg=heading, pitch_deg=pitch, roll_deg=roll)
-            more.append(pad(half_of_covariance(self.left_covariance) @ self.cam_from_local, (rig.quantities - 4, 1)))
+            more.append(
+                pad(half_of_covariance(self.attitude_covariance) @ self.cam_from_local, (rig.quantities - 4, 1))
+            )
         new.mounting = stands
         # The same number of shared errors at every time, for filters.
         more = [pad(half, (0, 0, 0, most - len(half))) for half, most in zip(more, (6, 3), strict=False)]
-        new.relative_root = torch.cat(more if known is None else [known, *more])
+        new.relative_root = torch.cat(more if self.root is None else [self.root, *more])
         if rig.calibration is not None:
             new.calibration = dataclasses.replace(rig.calibration, relocked=note)
         return new
@@ -349,7 +356,7 @@ def measure_drift(
     features: Features | None = None,
     landmarks: Landmarks | None = None,
     pose: tuple[Tensor, Tensor] | None = None,
-    before: tuple[Tensor, Tensor] | None = None,
+    root: Tensor | None = None,
     refraction: tuple[float, float] = (REFRACTION, REFRACTION_SIGMA),
 ) -> Drift:
     """Find how the cameras of a rig have turned.
@@ -366,8 +373,9 @@ def measure_drift(
         landmarks: pixels (L, 2, 2), left and right now; not with features that have a mark then.
         pose: rotation cam_from_local (3, 3) and center (3,) of the left camera when the rig was solved, in the frame of
             the landmarks; needed with these.
-        before: (3, 3) covariances of the relative turn and of the left camera's attitude (about its own axes) when the
-            rig was solved: part of what a turn is compared with, unless features have marks then.
+        root: (K, P) errors of the rig when it was solved, `Rig.root`: part of what a turn is compared with, unless
+            features have marks then. Errors of lenses and places were in the attitudes then, and are in those now: as
+            far as they move both alike, they are no turn.
         refraction: coefficient of refraction of the light from landmarks now, and its standard deviation.
 
     Raises:
@@ -432,24 +440,73 @@ def measure_drift(
     own = [vector_from_rotation(now @ then.T) for now, then in zip(state.rotation, start.rotation, strict=True)]
     alone = [known.of(known.turn_rows(c))[0] for c in (0, 1)]
     compared = covariance[:3, :3]
-    if before is not None:
-        compared = compared + before[0]
-        alone = [alone[0] + before[1], alone[1] + before[0] + relative @ before[1] @ relative.T]
+    spreads, standing = alone, rig.relative_root
+    if root is not None:
+        now = _turned_by_errors(work, mask, rig, root, [loose, True], rotation.T)
+        then = torch.stack([-root[:, rig.pose_columns(c)][:, 3:] @ rig.rotation[c].T for c in (0, 1)])
+        changed = now - then
+        spreads = [spread + each.T @ each for spread, each in zip(alone, changed, strict=True)]
+        between = now[1] - now[0] @ relative.T - then[1] + then[0] @ rig.right_from_left_rotation.T
+        compared = compared + between.T @ between
+        if loose and standing is not None:
+            moved = torch.linalg.cross(changed[1], rig.right_from_left_translation.expand_as(changed[1]))
+            standing[:, -13:-7] += torch.cat([between, moved], 1)
+            standing[:, -4:-1] = -now[0] @ state.rotation[0]
     return Drift(
         left=own[0] if loose else None,
         right=own[1] if loose else None,
         relative=drift,
-        left_covariance=alone[0] if loose else None,
-        right_covariance=alone[1] if loose else None,
+        left_covariance=spreads[0] if loose else None,
+        right_covariance=spreads[1] if loose else None,
         relative_covariance=compared,
         chi2=float(drift @ torch.linalg.solve(compared, drift)),
         old=rig,
         rig=Rig.pair(rig.left, rig.right, relative, state.rotation[1] @ (state.center[0] - state.center[1])),
+        root=standing,
         pose_covariance=covariance,
+        attitude_covariance=alone[0] if loose else None,
         cam_from_local=state.rotation[0] if pose is not None else None,
         items=records(work, mask, reasons).items,
         variance=fit.variance,
     )
+
+
+def _turned_by_errors(
+    work: adjustment.Adjustment, mask: Tensor, rig: Rig, root: Tensor, turning: Sequence[bool], local_from_rig: Tensor
+) -> Tensor:
+    """(2, K, 3) how the cameras are found to be turned, about their own axes, by each of K errors of the rig.
+
+    From the normal equations with lenses and places free as well: where these are off, turns give way.
+    """
+    count, lenses = len(root), root[:, : sum(rig.sizes)].split(rig.sizes, 1)
+    nothing = torch.zeros(count, dtype=torch.float64)
+    errors = dataclasses.replace(
+        held(work.data.cameras),
+        cameras=tuple(own.T for own in lenses),
+        board=nothing[None, :][:0],
+        begin=nothing,
+        known=nothing == 0.0,
+        labels=("",) * count,
+    )
+    if (light := work.unknowns.by_refraction) is not None:
+        errors = errors.and_refraction(work.unknowns.refraction, float(light))
+    start = Start(rotation=work.state.rotation, center=work.state.center)
+    wide = adjustment.Adjustment(work.data, start, errors, 1.0, turning=turning, moving=[True] * 2)
+    wide.state = work.state._replace(unknown=torch.cat([nothing, work.state.unknown]))
+    wide.widened = work.widened
+    problem = wide.problem(mask)
+    scaled, scale = problem.linearize(wide.part(mask)).information()
+    information = scaled / scale / scale[:, None]
+    turns = [torch.arange(slot.start, slot.stop) for slot in problem.turn if slot is not None]
+    found = torch.cat([torch.arange(count, len(errors)), *turns])
+    pull = information[found, :count]
+    for camera, slot in enumerate(problem.shift):
+        moved = root[:, rig.pose_columns(camera)][:, :3] @ local_from_rig.T
+        pull = pull + information[found, slot] @ moved.T
+    by_error = -torch.linalg.solve(information[found][:, found], pull)[len(errors) - count :]
+    out = by_error.new_zeros(2, count, 3)
+    out[list(turning)] = by_error.unflatten(0, (-1, 3)).transpose(1, 2)
+    return out
 
 
 def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift:
@@ -523,7 +580,9 @@ def drift_of_turns(
         chi2=float(drift @ torch.linalg.solve(pose[:3, :3], drift)),
         old=rig,
         rig=Rig.pair(rig.left, rig.right, change @ relative, turn @ shift),
+        root=rig.relative_root,
         pose_covariance=pose,
+        attitude_covariance=covariance[:3, :3],
         cam_from_local=None if cam_from_local is None else rotation_from_vector(left) @ cam_from_local,
         items=items,
         variance=variance,
@@ -565,17 +624,16 @@ def check_rig(rig: Rig, *, features: Features | None = None, landmarks: Landmark
         False
     """
     pose: tuple[Tensor, Tensor] | None = None
-    left = torch.zeros(3, 3, dtype=torch.float64)
     refraction = REFRACTION, REFRACTION_SIGMA
     if (stands := rig.mounting) is not None:
-        rotation = stands.enu_from_cam.T
-        pose = rotation, torch.zeros(3, dtype=torch.float64)
+        pose = stands.enu_from_cam.T, torch.zeros(3, dtype=torch.float64)
         if stands.covariance is not None:
-            left = rotation @ stands.covariance[3:6, 3:6] @ rotation.T
             # Light that was held straight stays so; otherwise another day has another coefficient.
             refraction = stands.refraction, REFRACTION_SIGMA if bool(stands.covariance[6, 6]) else 0.0
-    before = None if rig.covariance is None else (rig.covariance.matrix[-6:-3, -6:-3], left)
-    return measure_drift(rig, features=features, landmarks=landmarks, pose=pose, before=before, refraction=refraction)
+    known = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
+    known.covariance = rig.covariance
+    root = rig.root if landmarks is not None else known.root
+    return measure_drift(rig, features=features, landmarks=landmarks, pose=pose, root=root, refraction=refraction)
 
 
 def seen_again(then: Marks, now: Marks, sigma: float) -> Features:

@@ -11,6 +11,7 @@ from rig_scenes import CAMERAS, CENTER, ROTATION, landmarks, normal, spread_poin
 from torch import Tensor
 
 from kcal import DegenerateError, Features, InputError, Landmarks, Rig
+from kcal.gaussian import half_of_covariance
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.watch.turned import measure_drift
 
@@ -175,6 +176,15 @@ class TestFeatures:
         torch.testing.assert_close(found.relative, relative_turn(turns), rtol=0, atol=1e-9)
 
 
+def turned_root(rig: Rig, relative: Tensor, left: Tensor) -> Tensor:
+    """`Rig.root` of cameras in exact places, from covariances (3, 3) of the relative turn and of the left one."""
+    root = torch.zeros(6, rig.quantities, dtype=torch.float64)
+    first, second = (root[:, rig.pose_columns(c)][:, 3:] for c in (0, 1))
+    first[3:] = second[3:] = -half_of_covariance(left)
+    second[:3] = -half_of_covariance(relative) @ rig.right_from_left_rotation
+    return root
+
+
 class TestLandmarks:
     def test_turns_and_their_covariances_about_the_cameras_own_axes(self) -> None:
         marks = landmarks()
@@ -188,8 +198,9 @@ class TestLandmarks:
         torch.testing.assert_close(found.rig.right_from_left_translation, shift, rtol=0, atol=1e-7)
         # What was not known of the relative turn and of the left camera's attitude comes on top.
         relative, left = (torch.diag(tensor(*values)) for values in ((1e-9, 4e-9, 9e-9), (2e-9, 5e-9, 1e-8)))
-        wider = measure_drift(ROLLED_RIG, landmarks=marks, pose=pose, before=(relative, left), refraction=(0.0, 0.0))
-        onto = found.rig.right_from_left_rotation
+        root = turned_root(ROLLED_RIG, relative, left)
+        wider = measure_drift(ROLLED_RIG, landmarks=marks, pose=pose, root=root, refraction=(0.0, 0.0))
+        onto = ROLLED_RIG.right_from_left_rotation
         for name, more in (
             ("relative_covariance", relative),
             ("left_covariance", left),
@@ -229,7 +240,7 @@ class TestLandmarks:
         pose = (ROTATION[0], CENTER[0])
         rough = 1e-6 * torch.eye(3, dtype=torch.float64)
         assert measure_drift(RIG, landmarks=marks, pose=pose).significant
-        assert not measure_drift(RIG, landmarks=marks, pose=pose, before=(rough, rough)).significant
+        assert not measure_drift(RIG, landmarks=marks, pose=pose, root=turned_root(RIG, rough, rough)).significant
 
 
 class TestRefusals:
