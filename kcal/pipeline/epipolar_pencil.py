@@ -124,9 +124,8 @@ def meetings(lines: StationSights, rows: Ints, others: Ints, gate: float, neares
     kept = (squared < gate**2) & ~flat & (near > 0) & (far > 0)
     share = (spread[1] / both)[:, None]
     point = lines.center[a] + share * start + (1.0 - share) * end
-    return Meetings(
-        first[kept], second[kept], point[kept], np.sqrt(both[kept]) / crossing[kept], near[kept], squared[kept]
-    )
+    sigma = np.sqrt(both[kept]) / crossing[kept]
+    return Meetings(first[kept], second[kept], point[kept], sigma, near[kept], squared[kept])
 
 
 def near_in_angle(lines: StationSights, rows: Ints, others: Ints, gate: float, nearest: float) -> tuple[Ints, Ints]:
@@ -320,10 +319,9 @@ class Confirming:
             if c in trees:
                 # Marks of one camera are about as good as each other.
                 sigma = np.hypot(self.lines.wide(own[c][:1], away, c), meet.sigma) / away
-                apart, place = trees[c].query(
-                    np.column_stack([look, _ELSEWHERE * self.kind[meet.first]]),
-                    distance_upper_bound=self.gate * float(sigma.max(initial=0.0)) + 1e-12,
-                )
+                widest = self.gate * float(sigma.max(initial=0.0)) + 1e-12
+                wanted = np.column_stack([look, _ELSEWHERE * self.kind[meet.first]])
+                apart, place = trees[c].query(wanted, distance_upper_bound=widest)
                 squared = (apart / sigma) ** 2
                 hit = squared < self.gate**2
                 mark[hit] = own[c][place[hit]]
