@@ -489,9 +489,8 @@ def _joined(
     # Only what moves by turns, and by what is not known of places and lenses, is kept: the rest says how well the
     # skylines fit, which each image has told.
     moves = [white[:, : 3 * count], white[:, 3 * count : 6 * count] * center_sigma.numpy().reshape(-1)]
-    moves += [
-        white[:, a:b] @ fits.lens_errors(camera) for camera, a, b in zip(cameras, begin[:-1], begin[1:], strict=True)
-    ]
+    by_lens = np.split(white, begin, axis=1)[1:-1]
+    moves += [own @ fits.lens_errors(camera) for own, camera in zip(by_lens, cameras, strict=True)]
     basis, size, _ = np.linalg.svd(np.column_stack(moves), full_matrices=False)
     compact = basis[:, size > _TELLS].T @ white
     return SkylineSource(
