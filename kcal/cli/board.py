@@ -255,9 +255,8 @@ def board_in_images(images: Sequence[str | Path], square: str | None, time_limit
 
     first = images[0]
     with steps("looking for a board", None):
-        return kcal.corners.recognize_board(
-            rooms.spread_frames(first) if rooms.is_video(first) else images, square, time_limit=time_limit, note=say
-        )
+        shown = rooms.spread_frames(first) if rooms.is_video(first) else images
+        return kcal.corners.recognize_board(shown, square, time_limit=time_limit, note=say)
 
 
 _CURED = 6  # images that are looked at to name the board of a refusal
