@@ -225,11 +225,8 @@ def detect_command(
         )
     if unseen:
         out.print(f"corners left out as uncertain: {unseen} of {found * pattern.corners}")
-    print_left_out(
-        [f"failed {failure.name}: {failure.reason}" for failure in failures],
-        output,
-        f"{counted_text(len(failures), 'image')} failed",
-    )
+    lines = [f"failed {failure.name}: {failure.reason}" for failure in failures]
+    print_left_out(lines, output, f"{counted_text(len(lines), 'image')} failed")
     if not pattern.unambiguous:
         out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
 

@@ -272,7 +272,8 @@ def _checked_attitude(
     heading, pitch, roll = attitude(torch.from_numpy(fit.rotation.T.copy()))
     widened = math.sqrt(variance_factor(fit.chi2, fit.freedom))
     turn = _angles_by_turn(fit.rotation)
-    sigma = widened * np.sqrt(np.diag(turn @ fit.covariance @ turn.T))
+    total = np.diag(turn @ fit.covariance @ turn.T)
+    sigma = widened * np.sqrt(total)
     agreeing = float(fit.used.mean())
     few = f"{100 * agreeing:.0f} % of the skyline's clear columns agree in the best heading, {heading:.1f} degrees"
     below = (
@@ -308,7 +309,6 @@ def _checked_attitude(
     upright = np.where(columns.sigma > 0, seen.sigma / columns.sigma, 1.0)
     expected[at] = np.where(seen.known, columns.pixel[:, 1] + seen.residual / np.maximum(upright, 0.05), np.nan)
     used[at] = fit.used
-    total = np.diag(turn @ fit.covariance @ turn.T)
     back = fit.rotation.T
     return SkylineAttitude(
         rotation=fit.rotation,
