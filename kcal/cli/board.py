@@ -225,11 +225,8 @@ def detect_command(
         )
     if unseen:
         out.print(f"corners left out as uncertain: {unseen} of {found * pattern.corners}")
-    print_left_out(
-        [f"failed {failure.name}: {failure.reason}" for failure in failures],
-        output,
-        f"{counted_text(len(failures), 'image')} failed",
-    )
+    lines = [f"failed {failure.name}: {failure.reason}" for failure in failures]
+    print_left_out(lines, output, f"{counted_text(len(lines), 'image')} failed")
     if not pattern.unambiguous:
         out.print(f"note: this board looks the same turned by 180°; for stereo {pattern.stereo_advice}")
 
@@ -255,9 +252,8 @@ def board_in_images(images: Sequence[str | Path], square: str | None, time_limit
 
     first = images[0]
     with steps("looking for a board", None):
-        return kcal.corners.recognize_board(
-            rooms.spread_frames(first) if rooms.is_video(first) else images, square, time_limit=time_limit, note=say
-        )
+        shown = rooms.spread_frames(first) if rooms.is_video(first) else images
+        return kcal.corners.recognize_board(shown, square, time_limit=time_limit, note=say)
 
 
 _CURED = 6  # images that are looked at to name the board of a refusal

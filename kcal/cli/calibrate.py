@@ -255,6 +255,7 @@ def calibrate_command(
         outcomes = [joined_by_stars(outcomes[0], stars, night, places[0].output)]
     failed = [place.name for place, result in zip(places, outcomes, strict=True) if isinstance(result, KcalError)]
     usable = True
+    in_full = verbose or not options.hybrid
     figures: dict[str, dict[str, Any]] = {}
     for i, (place, result) in enumerate(zip(places, outcomes, strict=True)):
         if len(places) > 1:
@@ -268,17 +269,14 @@ def calibrate_command(
         result.save(place.output, name=place.name, source=source, temperature=temperature, setting=stated)
         if place.picture is not None:
             kcal.report.save_picture(place.picture, kcal.report.calibration_figure(result, place.name))
-        figures[place.name] = told_calibration(
-            result, place.output, reject=reject, verbose=verbose or not options.hybrid
-        )
+        figures[place.name] = told_calibration(result, place.output, reject=reject, verbose=in_full)
         if result.shared_board is not None:
             others = ", ".join(places[i].name for i in result.shared_board.others)
             out.print(f"the board is that of {others} (evidence {result.shared_board.evidence:.0f} nats)")
         print_wrote(place.output, place.picture)
         if needs or place.report is not None:
-            found = judged(
-                result, options, needs, baseline=baseline, mark_sigma=pixel_sigma_of(pixel_sigma), name=place.name
-            )
+            noise = pixel_sigma_of(pixel_sigma)
+            found = judged(result, options, needs, baseline=baseline, mark_sigma=noise, name=place.name)
             figures[place.name]["verdict"] = found.verdict.to_dict()
             usable = told_usable(found, place.report, result.findings) and usable
     tell(cameras=figures)

@@ -432,11 +432,7 @@ def file_schema(kind: str) -> dict[str, Any]:
     module, name, _ = FILES[kind]
     file = getattr(importlib.import_module(module), name)
     schema = file.model_json_schema(mode="serialization")
-    schema["properties"] = {
-        "kcal": {"const": file.KIND},
-        "version": {"const": file.VERSION},
-        **schema["properties"],
-    }
+    schema["properties"] = {"kcal": {"const": file.KIND}, "version": {"const": file.VERSION}, **schema["properties"]}
     # All fields of the version's first files are written, so that a reader need not know their defaults.
     schema["required"] = [name for name in schema["properties"] if name not in file._LATER]
     return {

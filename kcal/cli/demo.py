@@ -265,9 +265,8 @@ def simulated_site(output: Path, seed: int) -> None:
     _calibrate_both(output, {side: [output / "images" / f"{side}-near"] for side in SIDES}, size, lap)
     _write_places(output / "survey.csv", scene.surveyed(scene.landmarks), sigma=scene.survey_sigma)
     marks = scene.landmark_marks
-    rooms.write_marks(
-        output / "landmarks.csv", kcal.locate.Marks.of_pair(scene.landmarks.names, marks.left, marks.right)
-    )
+    landmarks = kcal.locate.Marks.of_pair(scene.landmarks.names, marks.left, marks.right)
+    rooms.write_marks(output / "landmarks.csv", landmarks)
     run(
         "rig", *(output / f"{side}.camera.json" for side in SIDES),
         "--landmarks", output / "survey.csv", "--marks", output / "landmarks.csv", "--pixel-sigma", scene.mark_sigma,
@@ -283,10 +282,9 @@ def simulated_site(output: Path, seed: int) -> None:
     command = locate_again(output, "--pixel-sigma", scene.mark_sigma, "--truth", output / "truth.csv")
     rig = rooms.load_pair(output / "rig.json")
     localize = kcal.Localizer(rig, pixel_sigma=scene.mark_sigma)
-    located, exact = (
-        kcal.locate_points(localize, kcal.locate.Marks.of_pair(targets.names, *pixels))
-        for pixels in ((marks.left, marks.right), (marks.true_left, marks.true_right))
-    )
+    both = (marks.left, marks.right), (marks.true_left, marks.true_right)
+    marked = (kcal.locate.Marks.of_pair(targets.names, *pixels) for pixels in both)
+    located, exact = (kcal.locate_points(localize, own) for own in marked)
     lap("positions and maps")
     rows, chance = rooms.truth_rows(located, exact, targets.enu), rooms.chance_text(located, targets.enu)
     out.print("\nTrue against estimated positions")
@@ -316,7 +314,6 @@ def _more_draws(scene: rooms.DemoScene, rig: kcal.Rig) -> str:
 def _write_places(path: Path, points: rooms.NamedPoints, sigma: float | None = None) -> None:
     """Write places as a surveyor hands them over, to a millimeter with a sigma, and exactly without."""
     form, known = ("{!r}", "") if sigma is None else ("{:.3f}", f"{sigma:g}")
-    rows = zip(points.names, points.enu.tolist(), strict=True)
-    write_atomic(
-        path, rooms.places_csv(rooms.LOCAL, ([name, *map(form.format, place), known, ""] for name, place in rows))
-    )
+    places = zip(points.names, points.enu.tolist(), strict=True)
+    rows = ([name, *map(form.format, place), known, ""] for name, place in places)
+    write_atomic(path, rooms.places_csv(rooms.LOCAL, rows))

@@ -217,10 +217,8 @@ def _night(site: practice.PracticeSite, side: practice.Side) -> NDArray[np.uint8
 
 def _sketch(site: practice.PracticeSite, path: Path, _: Callable[[], None]) -> None:
     scene = site.scene
-    groups = [
-        ([thing.name for thing in things], site.true_pixels("left", points.enu))
-        for things, points in ((practice.LANDMARKS, scene.landmarks), (practice.TARGETS, scene.targets))
-    ]
+    both = (practice.LANDMARKS, scene.landmarks), (practice.TARGETS, scene.targets)
+    groups = [([thing.name for thing in things], site.true_pixels("left", points.enu)) for things, points in both]
     rooms.save_site_sketch(path, site.picture("left", noise=0.0), *groups)
 
 
@@ -236,14 +234,12 @@ def _film(site: practice.PracticeSite, side: practice.Side, count: int, path: Pa
 def _detections(site: practice.PracticeSite, frames: int) -> str:
     """The ships as pairs of marks with noise, one line for each moment, as a detector with a matcher writes them."""
     random = np.random.default_rng([site.scene.seed, 3])
-    left, right = (practice.ship_boxes(site, side, frames) for side in practice.SIDES)
-    lines = []
-    for number in range(frames):
-        marks = [
-            (pixels[number] + _DETECTION_SIGMA * random.standard_normal((len(practice.PASSAGES), 2))).round(3).tolist()
-            for pixels in (left, right)
-        ]
-        lines.append({"time": number / practice.RATE, "left": marks[0], "right": marks[1], "sigma": _DETECTION_SIGMA})
+    pixels = np.stack([practice.ship_boxes(site, side, frames) for side in practice.SIDES], 1)
+    marks = (pixels + _DETECTION_SIGMA * random.standard_normal(pixels.shape)).round(3).tolist()
+    lines = [
+        {"time": number / practice.RATE, "left": left, "right": right, "sigma": _DETECTION_SIGMA}
+        for number, (left, right) in enumerate(marks)
+    ]
     return "".join(json.dumps(line) + "\n" for line in lines)
 
 

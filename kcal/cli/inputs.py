@@ -159,9 +159,7 @@ OBSERVATIONS = Wanted(
     _FROM_IMAGES,
 )
 SHOWN = dataclasses.replace(
-    ANY_CAMERA,
-    words="a camera, rig or observations file",
-    kinds=ANY_CAMERA.kinds | {"observations"},
+    ANY_CAMERA, words="a camera, rig or observations file", kinds=ANY_CAMERA.kinds | {"observations"}
 )
 BOARD = Wanted(
     "a kcal board file",

@@ -130,9 +130,8 @@ def live_command(
             late=lambda one: tracker.clock_estimate(one).offset(max(tracker.time, tracker.shared.start or 0.0))[0],
             match_sigma=match_sigma, tell=err.print,
         )  # fmt: skip
-    source = frames or rooms.lines_of(
-        lines, lambda line: rooms.read_moment(line, solved, joining, float(localize.pixel_sigma))
-    )
+    noise = float(localize.pixel_sigma)
+    source = frames or rooms.lines_of(lines, lambda line: rooms.read_moment(line, solved, joining, noise))
     log = journal if journal is not None else output[0].with_name(output[0].name + ".journal")
     with steps("live", lines.stat().st_size if lines is not None and lines.is_file() else None) as advance:
         stream = rooms.Stream(
@@ -377,9 +376,8 @@ def _of_frames(watcher: rooms.Watcher, frames: rooms.FramesTogether) -> Iterator
 
 
 def _folder_pairs(watcher: rooms.Watcher, folders: tuple[str, str]) -> Iterator[tuple[float, rooms.Gray, rooms.Gray]]:
-    timed = sorted(
-        (rooms.image_time(left), left, right) for left, right in rooms.image_pairs(*([folder] for folder in folders))
-    )
+    pairs = rooms.image_pairs(*([folder] for folder in folders))
+    timed = sorted((rooms.image_time(left), left, right) for left, right in pairs)
     for time, left, right in followed("watching", timed, lambda pair: pair[1].name):
         if watcher.due(time):
             yield time, rooms.read_gray(left), rooms.read_gray(right)
@@ -434,6 +432,5 @@ def _draw_turns(watched: kcal.rig.Watched, picture: Path, limit: float, title: s
     angle = np.degrees(np.stack([drift.relative.numpy() for drift in drifts]))
     sigma = np.degrees(np.stack([drift.relative_covariance.diagonal().sqrt().numpy() for drift in drifts]))
     seen = np.array(watched.seen[::step], bool)
-    print_wrote(
-        kcal.report.save_picture(picture, rooms.attitude_figure(np.array(times), angle, sigma, seen, limit, title))
-    )
+    figure = rooms.attitude_figure(np.array(times), angle, sigma, seen, limit, title)
+    print_wrote(kcal.report.save_picture(picture, figure))

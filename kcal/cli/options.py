@@ -228,9 +228,7 @@ class _Option:
             only = self.type is bool and self.default is False
             flags = self.kind.flags or ((self.label,) if only or self.name != _words(self.name) else ())
             info = typer.Option(*flags, hidden=self.kind.rare, metavar=self.kind.metavar, **shared)
-        return inspect.Parameter(
-            self.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[text, info]
-        )
+        return _keyword(self.name, default, Annotated[text, info])
 
     def value(self, given: Any) -> Any:
         """What the command gets."""
@@ -261,6 +259,10 @@ class _Option:
             if self.kind.usage:
                 raise typer.BadParameter(str(error)) from None
             raise
+
+
+def _keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
 def _words(name: str) -> str:
@@ -385,9 +387,7 @@ def declared(function: Callable[..., None], *, json: bool = True) -> Callable[..
     parameters = [one.parameter for one in options]
     if json:
         option = Annotated[bool, typer.Option("--json", help="Print one JSON object for programs in place of text.")]
-        parameters.append(
-            inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
-        )
+        parameters.append(_keyword("as_json", False, option))
     run.__doc__ = text
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -457,11 +457,8 @@ class Command(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; what it takes from kcal.toml is said first, in one line."""
-        names = [
-            param.name
-            for param in self.params
-            if getattr(ctx.get_parameter_source(param.name), "name", "") == "DEFAULT_MAP"
-        ]
+        sources = {param.name: ctx.get_parameter_source(param.name) for param in self.params}
+        names = [name for name, source in sources.items() if getattr(source, "name", "") == "DEFAULT_MAP"]
         taken.clear()
         taken.update(names)
         if names:
@@ -529,7 +526,7 @@ def _with_settings() -> inspect.Signature:
     for key, setting in SETTINGS.items():
         kind: Any = setting.kind
         annotation = Annotated[kind | None, Kind(metavar="VALUE", about=f"{{}}, for example {setting.example}.")]
-        parameters.append(inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation))
+        parameters.append(_keyword(key, None, annotation))
     return inspect.Signature(parameters)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
 from collections.abc import Callable
@@ -85,7 +86,7 @@ def mark_command(
     desk = rooms.Desk(pictures, session, own, known, old)
     try:
         desk.check_sizes()
-        server = rooms.LocalServer(lambda token, hosts: page(desk, token, hosts), port, fallback=port == _MARK_PORT)
+        server = rooms.LocalServer(functools.partial(page, desk), port, fallback=port == _MARK_PORT)
         show_page(server.address, "marking page", browser=browser)
         if session.version:
             err.print(f"continued after {counted_text(session.version, 'action')} in {session.files.log}")
@@ -162,9 +163,8 @@ def capture_command(
     threads = [threading.Thread(target=watch), threading.Thread(target=lambda: rooms.follow(session, until=over))]
     server = None
     if page:
-        server = rooms.LocalServer(
-            lambda token, hosts: rooms.capture_app(session, stop, token, hosts), port, fallback=port == _CAPTURE_PORT
-        )
+        app = functools.partial(rooms.capture_app, session, stop)
+        server = rooms.LocalServer(app, port, fallback=port == _CAPTURE_PORT)
         show_page(server.address, "capture page", browser=browser)
     try:
         for thread in threads:

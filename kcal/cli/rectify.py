@@ -332,9 +332,8 @@ def _tell_ranges(module: kcal.lens.StereoRectification) -> None:
     ranges = rooms.usual_ranges(module.rig)
     apart = float(module.right_center[:2].sum())
     disparity = focal * apart * ahead / torch.tensor(ranges, dtype=torch.float64)
-    found = kcal.locate.DisparityRanges(module, disparity_sigma=_DISPARITY_SIGMA).at(
-        where.expand(len(ranges), 2), disparity
-    )
+    ranged = kcal.locate.DisparityRanges(module, disparity_sigma=_DISPARITY_SIGMA)
+    found = ranged.at(where.expand(len(ranges), 2), disparity)
     rows = [["range, m", "disparity, px", f"sigma, m, of ± {_DISPARITY_SIGMA} px", "95 % from", "to"]]
     for i, at in enumerate(ranges):
         cells = (found.sigma[i], found.low[i], found.high[i])

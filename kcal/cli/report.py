@@ -205,9 +205,8 @@ def _pairs(rig: kcal.Rig, observations: Sequence[Path]) -> tuple[tuple[rooms.Ten
     """Corners of the board and pixels of pairs of views, or why there are none."""
     left, right = (kcal.Observations.load(file) for file in observations)
     try:
-        boards = kcal.rig.paired_boards(
-            (rig.left, rig.right), (left, right), kcal.rig.pair_by_name(left.names, right.names)
-        )
+        matched = kcal.rig.pair_by_name(left.names, right.names)
+        boards = kcal.rig.paired_boards((rig.left, rig.right), (left, right), matched)
     except InputError as error:
         return None, str(error)
     return (boards.points, boards.pixels), ""
@@ -422,10 +421,9 @@ def _told_refits(found: rooms.IntervalCheck, count: int) -> bool:
         "error_px": ("error px, RMS", "{:.3g}"), "stated_px": ("stated px, RMS", "{:.3g}"),
         "factor": ("σ should be", "x {:.2f}"),
     }  # fmt: skip
-    parts = zip(found.ranges, found.shares, found.coverage, found.rms, found.factors, strict=True)
-    rows = [
-        [at, *shares, float(places[places.isfinite()].min()), *rms, factor] for at, shares, places, rms, factor in parts
-    ]
+    lowest = [float(places[places.isfinite()].min()) for places in found.coverage]
+    parts = zip(found.ranges, found.shares, lowest, found.rms, found.factors, strict=True)
+    rows = [[at, *shares, least, *rms, factor] for at, shares, least, rms, factor in parts]
     tell_table("ranges", Table(columns, rows))
     if found.failed:
         warn(f"{found.failed} of {count} simulated captures could not be calibrated; they are not counted")

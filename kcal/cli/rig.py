@@ -35,12 +35,10 @@ def source_lines(result: rooms.RigResult) -> list[str]:
     """Residuals by source."""
     rows = [["source", "used", "left out", "RMS px", "RMS", "sigmas"]]
     for source in result.sources:
-        cells = [
-            "" if source.rms_px is None else f"{source.rms_px:.4f}",
-            "" if source.rms_m is None else length_text(source.rms_m),
-        ]
+        pixels = "" if source.rms_px is None else f"{source.rms_px:.4f}"
+        length = "" if source.rms_m is None else length_text(source.rms_m)
         sigmas = "" if source.sigmas is None else f"{source.sigmas:.2f}"
-        rows.append([source.name, f"{source.used}", f"{source.left_out}", *cells, sigmas])
+        rows.append([source.name, f"{source.used}", f"{source.left_out}", pixels, length, sigmas])
     return aligned(rows)
 
 
@@ -231,10 +229,7 @@ _OF_ONE = (
 
 
 def station_command(
-    camera: kinds.CalibratedCamera,
-    *,
-    output: kinds.NewFile,
-    sources: Annotated[Sources, Only(_OF_ONE)],
+    camera: kinds.CalibratedCamera, *, output: kinds.NewFile, sources: Annotated[Sources, Only(_OF_ONE)]
 ) -> None:
     """Solve how one camera stands on the Earth: position, heading, pitch and roll, with error bars.
 
@@ -481,9 +476,8 @@ def rig_check_command(
     old = rooms.load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, old)
     now = kcal.locate.read_marks(marks, single=True)
-    features = (
-        None if reference is None else rooms.seen_again(kcal.locate.read_marks(reference, single=True), now, noise)
-    )
+    then = None if reference is None else kcal.locate.read_marks(reference, single=True)
+    features = None if then is None else rooms.seen_again(then, now, noise)
     surveyed = None if landmarks is None else _landmarks(old, landmarks, now, noise)
     drift = kcal.rig.check_rig(old, features=features, landmarks=surveyed)
     print_turns(drift, f"{sum(item.used for item in drift.items)} of {len(drift.items)}")

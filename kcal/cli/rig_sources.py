@@ -196,10 +196,7 @@ def _add_scene(read: RigReading, words: Sequence[str]) -> None:
     warn(*(f"{text}; left out" for text in refused))
     features, counts = rooms.scene_of((first, second), pairs, found)
     rows: list[tuple[str, ...]] = [("scene", "matched", "no texture", "off the line", "moved", "thinned", "used")]
-    rows += [
-        (one.name, *map(str, (one.matched, one.untextured, one.off_line, one.moved, one.thinned, one.used)))
-        for one in counts
-    ]
+    rows += [tuple(map(str, dataclasses.astuple(one))) for one in counts]
     read.notes += aligned(rows)
     if alone := sum(len(rooms.expand_images(one)) for one in given) - 2 * len(chosen):
         read.notes.append(f"{counted_text(alone, 'image')} of the scene without partner")
@@ -343,16 +340,12 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
     for number, position in places.items():
         centers[number], sigma[number] = position.point, position.sigma
     with steps("comparing skylines with the terrain", None):
-        known = {} if given.terrain_sigma is None else {
-            "sigma": given.terrain_sigma, "offset": 0.5 * given.terrain_sigma,
-        }  # fmt: skip
-        error = kcal.rig.RasterError(
-            refraction=given.refraction.value, refraction_sigma=given.refraction_sigma, **known
-        )
-        source, found = kcal.rig.skyline_source(
-            images, list(read.cameras.values()), kcal.locate.terrain(raster, given.geoid or 0.0), read.origin,
-            centers, sigma, error=error,
-        )  # fmt: skip
+        error = kcal.rig.RasterError(refraction=given.refraction.value, refraction_sigma=given.refraction_sigma)
+        if given.terrain_sigma is not None:
+            error = dataclasses.replace(error, sigma=given.terrain_sigma, offset=0.5 * given.terrain_sigma)
+        ground = kcal.locate.terrain(raster, given.geoid or 0.0)
+        cameras = list(read.cameras.values())
+        source, found = kcal.rig.skyline_source(images, cameras, ground, read.origin, centers, sigma, error=error)
     shown = [(image.name, image.image) for image in images]
     draw_picture(given.skyline_picture, lambda: rooms.skyline_figure(shown, found))
     read.notes += [line for image, one in zip(images, found, strict=True) for line in _lines(image, names, one)]
@@ -363,9 +356,8 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
 def _lines(image: kcal.rig.SkylineImage, names: Sequence[str], found: rooms.SkylineAttitude) -> list[str]:
     heading, pitch, roll = found.sigma_deg.tolist()
     shares = ", ".join(f"{name} {100 * share[0]:.0f} %" for name, share in found.shares.items() if share[0] > 0.005)
-    second = "" if math.isnan(found.second_deg) else (
-        f"; next best heading {found.second_deg:.1f}° (χ² larger by {found.second_worse:.0f})"
-    )  # fmt: skip
+    next_best = f"; next best heading {found.second_deg:.1f}° (χ² larger by {found.second_worse:.0f})"
+    second = "" if math.isnan(found.second_deg) else next_best
     return [
         f"skyline {image.name}: heading {found.heading_deg:.4f} ± {heading:.4f}°, pitch {found.pitch_deg:.4f} ± "
         f"{pitch:.4f}°, roll {found.roll_deg:.4f} ± {roll:.4f}° by this image alone; {int(found.used.sum())} of "
@@ -558,9 +550,8 @@ def _add_landmarks(read: RigReading, path: Path) -> None:
 def _add_pairs(read: RigReading, files: Sequence[Path]) -> None:
     """Boards that two cameras saw, or any of more."""
     if len(read.cameras) != 2:
-        own = {
-            c: kcal.Observations.load(path) for c, path in zip(cameras_of_files(files, read.names), files, strict=True)
-        }
+        numbers = cameras_of_files(files, read.names)
+        own = dict(zip(numbers, map(kcal.Observations.load, files), strict=True))
         read.add("boards", rooms.boards_of_several(list(read.cameras.values()), read.names, own))
         return
     if len(files) != 2:

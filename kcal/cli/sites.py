@@ -220,7 +220,6 @@ def budget_command(
         print_star_budget(chosen, aperture, pitch, clock_sigma)
     if picture is not None:
         sweep = rooms.plotted_ranges(far)
-        kcal.report.save_picture(
-            picture, rooms.budget_figure(sweep, kcal.locate.range_errors(chosen, sweep, errors), labels)
-        )
+        figure = rooms.budget_figure(sweep, kcal.locate.range_errors(chosen, sweep, errors), labels)
+        kcal.report.save_picture(picture, figure)
     print_wrote(picture)

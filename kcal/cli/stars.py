@@ -314,6 +314,5 @@ def _told(path: Path, found: rooms.NamedStars) -> dict[str, Any]:
 def _draw(picture: Path, image: Any, found: rooms.NamedStars, catalog: kcal.stars.StarCatalog, title: str) -> None:
     star = found.attitude.star.tolist()
     names = [catalog.name_of(int(catalog.number[i])) if i >= 0 else "" for i in star]
-    kcal.report.save_picture(
-        picture, rooms.stars_figure(image, found.detected.pixels, names, found.attitude.residual, title)
-    )
+    figure = rooms.stars_figure(image, found.detected.pixels, names, found.attitude.residual, title)
+    kcal.report.save_picture(picture, figure)

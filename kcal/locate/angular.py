@@ -74,9 +74,8 @@ def triangulate_pairs(rays_left: Tensor, rays_right: Tensor, right_from_left: tu
     if whole or rays_left.shape[-2] <= CHUNK:
         return meeting_points(rays_left @ axes, rays_right @ axes_right, axes, length)
     pieces = zip(rays_left.split(CHUNK, -2), rays_right.split(CHUNK, -2), strict=True)
-    points, valid = zip(
-        *(meeting_points(left @ axes, right @ axes_right, axes, length) for left, right in pieces), strict=True
-    )
+    found = [meeting_points(left @ axes, right @ axes_right, axes, length) for left, right in pieces]
+    points, valid = zip(*found, strict=True)
     return Found(torch.cat(points, -2), torch.cat(valid, -1))
 
 

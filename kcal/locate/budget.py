@@ -118,6 +118,7 @@ def range_errors(
     far, points, left, right = points_at(rig, distances, pixel)
     ray = points[0] / far[0]
     with torch.no_grad():
+        across = _crossing(rig, ray)
         # In which a point moves in the right image as it comes nearer.
         nearer = rig(points * (1.0 - 1e-4))[0][..., 1, :] - rig.right.project(rig.right_from_left(points))[0]
         along = nearer / torch.linalg.vector_norm(nearer, dim=-1, keepdim=True)
@@ -125,10 +126,7 @@ def range_errors(
             "disparity": lambda s: (rig, right + s * errors.disparity_px * along),
             "yaw": lambda s: (right_turned(rig, far.new_tensor([0.0, s * math.radians(errors.yaw_deg), 0.0])), right),
             "baseline": lambda s: (_stretched(rig, s * errors.baseline_m), right),
-            "timing": lambda s: (
-                rig,
-                rig(points + s * _crossing(rig, ray) * errors.timing_s * errors.speed_mps)[0][..., 1, :],
-            ),
+            "timing": lambda s: (rig, rig(points + s * across * errors.timing_s * errors.speed_mps)[0][..., 1, :]),
         }
         found = {}
         for name, move in moved.items():
@@ -363,10 +361,9 @@ def station_sigmas(rig: Rig, distance: float, *, pixel_sigma: float | None = Non
     within = row_space(lenses.T)
     # With exact lenses, what their errors have in common with the poses is known too.
     exact = root - within @ (within.T @ root)
-    marks, without, total = (
-        _range_sigma(Localizer(rig, weights="all", pixel_sigma=pixel_sigma, root=known)(pixels, seen), rays, distance)
-        for known in (torch.zeros_like(root), exact, root)
-    )
+    roots = torch.zeros_like(root), exact, root
+    found = (Localizer(rig, weights="all", pixel_sigma=pixel_sigma, root=known)(pixels, seen) for known in roots)
+    marks, without, total = (_range_sigma(one, rays, distance) for one in found)
     worst = total.nan_to_num(nan=torch.inf).argmax()
     total, marks, without = (value[worst][None] for value in (total, marks, without))
     pose = (without.square() - marks.square()).clamp_min(0.0).sqrt()
@@ -540,9 +537,8 @@ def check_ranges(
         raise InputError("sigmas: a range with a sigma of a third of it or more checks nothing; are both in meters?")
     if not 0.0 < level < 1.0:
         raise InputError(f"level: a share between 0 and 1 is needed, got {level}")
-    found = fit_pairs(
-        rig, pixels[:, 0], pixels[:, 1], marks.covariance_or(mark_sigma), noise=mark_sigma, by_camera=True
-    )
+    stated = marks.covariance_or(mark_sigma)
+    found = fit_pairs(rig, pixels[:, 0], pixels[:, 1], stated, noise=mark_sigma, by_camera=True)
     for name, status, fine in zip(names, found.status.tolist(), found.fitted.tolist(), strict=True):
         if not fine:
             raise InputError(f"{name}: {PositionStatus(status).name}: its marks give no range; correct or delete them")
@@ -660,10 +656,8 @@ def read_known_ranges(path: str | Path, marks: str | Path | None = None) -> Know
     if bool(inside) == (marks is not None):
         wanted = "marks stand in both tables; leave --marks out" if inside else "no columns of marks; give --marks"
         raise FileError(f"{path}: {wanted} ({_HEADER})")
-    rows = read_rows(
-        path, _HEADER, ("name", *PIXELS, *COVARIANCE, *_COLUMNS, "note"),
-        (*(PIXELS if marks is None else ("name",)), *_COLUMNS),
-    )  # fmt: skip
+    columns = ("name", *PIXELS, *COVARIANCE, *_COLUMNS, "note")
+    rows = read_rows(path, _HEADER, columns, (*(PIXELS if marks is None else ("name",)), *_COLUMNS))
     names = tuple(row.name for row in rows)
     known = torch.tensor([[_known_meters(row, column) for column in _COLUMNS] for row in rows], dtype=torch.float64)
     found = read_marks(path, more=_COLUMNS) if marks is None else read_marks(marks)

@@ -77,9 +77,8 @@ def kml_points(columns: PositionColumns) -> str:
     places = number_lines(np.stack([found.column("lon"), found.column("lat"), height - geoid], -1))
     ranges = np.stack([found.column(name) for name in ("range_m", "range_low_m", "range_high_m")], -1)
     placemarks = []
-    for name, reason, place, (distance, low, high) in zip(
-        found.names, found.reasons, places, ranges.tolist(), strict=True
-    ):
+    points = zip(found.names, found.reasons, places, ranges.tolist(), strict=True)
+    for name, reason, place, (distance, low, high) in points:
         text = f"range {distance:.1f} m, 95 %: {low:.1f} to {high:.1f} m"
         known = not place.endswith(",")
         text = f"{text}. {reason}" if reason else text
@@ -244,9 +243,8 @@ def cot_events(columns: PositionColumns, run: Located, *, time: datetime | None 
     vertical = 1.96 * np.sqrt(np.maximum(found.column("cov_uu_m2"), 0.0))
     errors = zip(found.column("cep95_m").tolist(), vertical.tolist(), strict=True)
     events = []
-    for name, reason, (lat, lon, height, *_), (circle, up) in zip(
-        found.names, found.reasons, found.numbers.tolist(), errors, strict=True
-    ):
+    points = zip(found.names, found.reasons, found.numbers.tolist(), errors, strict=True)
+    for name, reason, (lat, lon, height, *_), (circle, up) in points:
         identity = hashlib.sha256(f"{station} {name}".encode()).hexdigest()[:16]
         more = f". {escape(reason)}" if reason else ""
         events.append(

@@ -374,14 +374,13 @@ class Localizer(Operations, Movable, StatedModule):
         if found := self.as_operation("forward", left, right, cov, mask):
             return Localization(*found)
         differentiated = is_differentiated(left, right, cov, self)
+        noise, by_camera = self.pixel_sigma, self.calibration_factor is not None
 
         def locate(left: Tensor, right: Tensor, cov: Tensor | None, mask: Tensor | None) -> Localization:
-            return self._by_marks(
-                viewing.fit_pairs(
-                    self.rig, left, right, cov, mask, noise=self.pixel_sigma,
-                    by_camera=self.calibration_factor is not None, differentiated=differentiated,
-                )
-            )  # fmt: skip
+            found = viewing.fit_pairs(
+                self.rig, left, right, cov, mask, noise=noise, by_camera=by_camera, differentiated=differentiated
+            )
+            return self._by_marks(found)
 
         return stereo.piece_by_piece(locate, left, right, cov, mask, differentiated=differentiated)
 

@@ -185,9 +185,8 @@ def read_marks(
             unknown.expand(len(marks.names), 4, 4) if marks.covariance is None else marks.covariance for marks in found
         ]
         covariance = torch.cat(parts)
-    extras = {
-        name: [cell for marks in found for cell in marks.extras[name]] for name in more or () if name in found[0].extras
-    }
+    known = [name for name in more or () if name in found[0].extras]
+    extras = {name: [cell for marks in found for cell in marks.extras[name]] for name in known}
     return Marks(names, torch.cat([marks.pixels for marks in found]), covariance, None, extras)
 
 

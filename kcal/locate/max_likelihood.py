@@ -150,9 +150,8 @@ def most_likely(
     turned_base = rotation @ base[..., None, :, :]
     nothing = tuple(() for _ in cameras)
     first = torch.where(usable, start[1], 0.0).detach()
-    fixed = _Fixed(
-        lenses, scale, turned_base, columns, pixels, usable, weight, nothing, first, around or Surroundings()
-    )
+    around = around or Surroundings()
+    fixed = _Fixed(lenses, scale, turned_base, columns, pixels, usable, weight, nothing, first, around)
     whole = fixed._replace(wanted=wanted)
     # After a step, the evaluation that finds nothing left to move is also the last one.
     later = fixed if differentiated or is_traced() else whole

@@ -304,13 +304,10 @@ def read_sightings(path: str | Path, cameras: Sequence[str]) -> tuple[Sighting, 
     found = []
     for (camera_number, label), own in of.items():
         times = sorted(own)
+        stamps = torch.tensor(times, dtype=torch.float64)
         values = torch.tensor([own[time] for time in times], dtype=torch.float64)
-        found.append(
-            Sighting(
-                label=label, camera=camera_number, times=torch.tensor(times, dtype=torch.float64),
-                pixels=values[:, :2], sigma=values[:, 2],
-            )
-        )  # fmt: skip
+        pixels, sigma = values[:, :2], values[:, 2]
+        found.append(Sighting(label=label, camera=camera_number, times=stamps, pixels=pixels, sigma=sigma))
     return tuple(found)
 
 
@@ -489,9 +486,8 @@ def _agreed_pose(
 def _clock(tracks: Sequence[MovingTrack], seen: Sequence[_Seen], near: dict[int, Tensor], sigma: float) -> float:
     """Seconds to be added to the cameras' times: where the poses of all cameras together fit best."""
     claims = _claims(tracks, seen)
-    pairs = {
-        c: [p for p in claims if p[0].sighting.camera == c] for c in sorted({p[0].sighting.camera for p in claims})
-    }
+    seeing = sorted({one.sighting.camera for one, _ in claims})
+    pairs = {c: [p for p in claims if p[0].sighting.camera == c] for c in seeing}
     if not pairs:
         if len(near) == 0:
             raise InputError(
@@ -551,14 +547,12 @@ def _identities(
         chosen = [_chosen(row, tracks, one) for row, one in zip(table, own, strict=True)]
         pairs = [(one, tracks[k]) for one, k in zip(own, chosen, strict=True) if k is not None]
         found = _agreed_pose(pairs, near, clock) or found
-    table = misfits(found)
-    return [
-        Identity(
-            one.sighting.camera, one.sighting.label,
-            None if (k := _chosen(row, tracks, one)) is None else tracks[k].name, float(row.min()),
-        )
-        for row, one in zip(table, own, strict=True)
-    ]  # fmt: skip
+    identities = []
+    for row, one in zip(misfits(found), own, strict=True):
+        k = _chosen(row, tracks, one)
+        name = None if k is None else tracks[k].name
+        identities.append(Identity(one.sighting.camera, one.sighting.label, name, float(row.min())))
+    return identities
 
 
 def _sigmas(track: MovingTrack, one: _Seen, pose: tuple[Tensor, Tensor, float], clock: float) -> float:

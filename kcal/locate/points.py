@@ -169,9 +169,8 @@ class PointLocator:
         stated: Tensor | Ground | None = self.ground
         if self.ground is None and self.height is not None:
             stated = torch.full((len(marks.names),), self.height[0], dtype=torch.float64)
-        found = self.localize(
-            marks.pixels, cov=cov, height=stated, height_sigma=1.0 if self.height is None else self.height[1]
-        )
+        height_sigma = 1.0 if self.height is None else self.height[1]
+        found = self.localize(marks.pixels, cov=cov, height=stated, height_sigma=height_sigma)
         own = found
         if rig.origin is not None:
             own = found._replace(bearing=(own_axes(rig)[found.anchor] @ found.bearing[..., None])[..., 0])

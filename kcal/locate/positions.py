@@ -268,10 +268,8 @@ def ring_blocks(columns: PositionColumns, run: Located) -> Iterator[NDArray[np.f
     for part in located.split(_AT_ONCE) if len(located) else ():
         east, north, up, lon_of_point = (part[:, NUMBERS.index(name)] for name in ("east_m", "north_m", "up_m", "lon"))
         outline = _level_outline(torch.stack([east, north], -1), part[:, upper], REGION_SHARE, run.centers is not None)
-        x, y, z = (
-            row[0] * outline[0] + row[1] * outline[1] + (row[2] * up[:, None] + offset)
-            for row, offset in zip(rotation, translation, strict=True)
-        )
+        axes = zip(rotation, translation, strict=True)
+        x, y, z = (row[0] * outline[0] + row[1] * outline[1] + (row[2] * up[:, None] + offset) for row, offset in axes)
         lat, lon = latitude_longitude(x, y, z)
         lon = lon + 360.0 * torch.round((lon_of_point[:, None] - lon) / 360.0)
         yield torch.stack([torch.cat([value, value[:, :1]], 1) for value in (lat, lon)], -1).numpy()

@@ -398,7 +398,7 @@ def rank_sites(
     chosen: list[RankedSite] = []
     build = len(candidates) if build is None else build
     while left and (len(chosen) < build or not alone):
-        best: tuple[float, int, Site] | None = None
+        tried: list[tuple[float, int, Site]] = []
         for i in left:
             options = [candidates[i]]
             if candidates[i].heading_deg is None and candidates[i].field_deg < 360.0:
@@ -413,11 +413,10 @@ def rank_sites(
                 views[i].turn(site)
                 covered = min(1.0, float(weight @ (times + views[i].sees > 1).double()))
                 alone[i] = site, math.sqrt(variance), covered
-            if best is None or variance < best[0]:
-                best = variance, i, site
-        if best is None or len(chosen) >= build:
+            tried.append((variance, i, site))
+        if len(chosen) >= build:
             break
-        variance, i, site = best
+        variance, i, site = min(tried, key=lambda one: one[0])
         views[i].turn(site)
         total, times = total + views[i].information, times + views[i].sees
         left.remove(i)
@@ -573,10 +572,7 @@ def sites_of(rig: Rig, pixel_sigma: float | None = None) -> list[Site]:
     sites, localize = [], Localizer(rig, weights="all", pixel_sigma=pixel_sigma)
     for c, (name, camera) in enumerate(zip(rig.names, rig.each, strict=True)):
         stands = station_mounting(rig, c)
-        width, height = camera.size
-        across, down = (
-            torch.linspace(0.25, 0.75, _PLACES, dtype=torch.float64) * (side - 1) for side in (width, height)
-        )
+        across, down = (torch.linspace(0.25, 0.75, _PLACES, dtype=torch.float64) * (side - 1) for side in camera.size)
         pixels = torch.cartesian_prod(across, down)
         rays, valid = camera.unproject(pixels)
         pixels, rays = pixels[valid], rays[valid]

@@ -92,15 +92,13 @@ def stated_mounting(
         >>> drone.covariance[3:, 3:].diagonal().sqrt().rad2deg().round(decimals=6).tolist()
         [0.0, 0.5, 1.0]
     """
-    angles = (math.radians(one[1]) for one in (heading_deg, pitch_deg, roll_deg))
-    sigma = torch.tensor([*sigma_m, *angles], dtype=torch.float64)
+    (heading, pitch, roll), sigma_deg = zip(heading_deg, pitch_deg, roll_deg, strict=True)
+    sigma = torch.tensor([*sigma_m, *map(math.radians, sigma_deg)], dtype=torch.float64)
     if not bool((sigma.isfinite() & (sigma >= 0)).all()):
         raise InputError("a station: sigmas must be finite and not negative")
-    axes = _axes(heading_deg[0], pitch_deg[0], roll_deg[0])
+    axes = _axes(heading, pitch, roll)
     by = torch.block_diag(torch.eye(3).double(), axes) * sigma
-    return Mounting(
-        origin=origin, heading_deg=heading_deg[0], pitch_deg=pitch_deg[0], roll_deg=roll_deg[0], covariance=by @ by.T
-    )
+    return Mounting(origin=origin, heading_deg=heading, pitch_deg=pitch, roll_deg=roll, covariance=by @ by.T)
 
 
 # Columns of a table of known poses.
@@ -190,10 +188,8 @@ def station_rig(
     origin = stands[0].origin
     ecef_from_frame = ecef_from_enu_rotation(origin.lat, origin.lon)
     local_from_frame = [ecef_from_enu_rotation(one.origin.lat, one.origin.lon).T @ ecef_from_frame for one in stands]
-    rotation = [
-        enu_from_cam(one.heading_deg, one.pitch_deg, one.roll_deg).T @ turn
-        for one, turn in zip(stands, local_from_frame, strict=True)
-    ]
+    looks = [enu_from_cam(one.heading_deg, one.pitch_deg, one.roll_deg) for one in stands]
+    rotation = [look.T @ turn for look, turn in zip(looks, local_from_frame, strict=True)]
     center = geodetic_to_enu(torch.stack([one.origin.geodetic for one in stands]), origin)
     rig = Rig(
         [*cameras.values()], [*cameras], torch.stack(rotation), center=center, origin=origin, refraction=refraction

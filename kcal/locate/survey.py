@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import warnings
@@ -288,10 +289,8 @@ def camera_positions(survey: Survey, cameras: Sequence[str]) -> tuple[MeasuredPo
     unknown = [name for name in survey.names if name not in cameras]
     if unknown:
         raise InputError(f"camera positions: {unknown[0]!r} is no camera; the names are {', '.join(cameras)}")
-    return tuple(
-        MeasuredPosition(camera=cameras.index(name), point=point, sigma=sigma)
-        for name, point, sigma in zip(survey.names, survey.points, survey.sigma, strict=True)
-    )
+    places = zip(map(cameras.index, survey.names), survey.points, survey.sigma, strict=True)
+    return tuple(MeasuredPosition(camera=camera, point=point, sigma=sigma) for camera, point, sigma in places)
 
 
 # Read surveyed places from GeoJSON and GPX, which state no accuracy: it must be given.
@@ -409,11 +408,9 @@ def _stated(properties: dict[str, Any], name: str) -> tuple[float, float] | None
 
 def _stated_number(value: Any, what: str) -> float:
     """A number, also one that a program has written as a text."""
-    try:
+    with contextlib.suppress(ValueError):
         if isinstance(value, int | float | str) and not isinstance(value, bool):
             return float(value)
-    except ValueError:
-        pass
     raise ValueError(f"{what} is {value!r:.40}; a number is needed")
 
 
@@ -427,9 +424,8 @@ def _from_gpx(root: xml.etree.ElementTree.Element, geoid: float) -> list[_Place]
         if not parts.get("ele"):
             raise ValueError(f"{name}: no elevation (ele)")
         height = float(parts["ele"]) + geoid
-        places.append(
-            _Place(name, _origin(name, float(element.attrib["lat"]), float(element.attrib["lon"]), height), None)
-        )
+        lat, lon = (float(element.attrib[axis]) for axis in ("lat", "lon"))
+        places.append(_Place(name, _origin(name, lat, lon, height), None))
     return places
 
 

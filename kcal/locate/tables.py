@@ -391,13 +391,8 @@ def read_chunks(
         return ((name, line) for chunk in again for name, line in zip(chunk.names, chunk.lines, strict=True))
 
     with _text_of(path) as file, closing(DistinctKeys(path, names_again)) as earlier:
-        line = 0
-        names: list[str] = []
         texts_of = _lines_of(path, file)
-        while not names and (text := next(texts_of, "")):
-            rows, beyond = _split_any(path, [text], texts_of, line)
-            line += 1 + beyond
-            names = rows[0][1] if rows else []
+        names, line = _first_row(path, texts_of)
         if not names:
             raise FileError(f"{path}: the file is empty; the first line must be {header}")
         _check_header(f"{path}: line {line}", names, header, columns, required, extras)
@@ -442,12 +437,18 @@ def header_of(path: str | Path) -> list[str]:
     """
     path = Path(path)
     with _text_of(path) as file:
-        texts = _lines_of(path, file)
-        while text := next(texts, ""):
-            rows, _ = _split_any(path, [text], texts, 0)
-            if rows:
-                return rows[0][1]
-    return []
+        return _first_row(path, _lines_of(path, file))[0]
+
+
+def _first_row(path: Path, texts: Iterator[str]) -> tuple[list[str], int]:
+    """Names of the columns, none in an empty file, and how many lines were read."""
+    line = 0
+    for text in texts:
+        rows, beyond = _split_any(path, [text], texts, line)
+        line += 1 + beyond
+        if rows:
+            return rows[0][1], line
+    return [], line
 
 
 @contextmanager

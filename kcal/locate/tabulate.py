@@ -318,15 +318,14 @@ def _share(ratio: Tensor, ellipse: _Ellipse, nodes: int) -> Tensor:
 
 
 @functools.lru_cache(maxsize=4)
-def _rules(nodes: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _rules(nodes: int, device: torch.device) -> tuple[Tensor, ...]:
     """Gauss-Hermite nodes and weights; and sin θ of Gauss-Legendre nodes, with weights that contain cos θ."""
     normal, normal_weight = np.polynomial.hermite_e.hermegauss(nodes)
     unit, unit_weight = np.polynomial.legendre.leggauss(nodes)
     angle = 0.5 * math.pi * unit
     scale = math.sqrt(0.5 / math.pi)
     rules = (normal, scale * normal_weight, np.sin(angle), scale * 0.5 * math.pi * unit_weight * np.cos(angle))
-    first, second, third, fourth = (torch.as_tensor(rule, device=device) for rule in rules)
-    return first, second, third, fourth
+    return tuple(torch.as_tensor(rule, device=device) for rule in rules)
 
 
 def _sampled(enu: Tensor, covariance: Tensor, shares: tuple[float, ...]) -> Tensor:

@@ -169,9 +169,8 @@ class ViewsFit(NamedTuple):
     @torch.no_grad()
     def behind(self, center: Tensor) -> Tensor:
         """(N,) whether a point is behind a camera that saw it; `center` (C, 3)."""
-        offset = self.fit.direction.mT[..., None, :] + (self.fit.inverse / self.scale)[..., None, None] * (
-            self.place[..., None, :] - center
-        )
+        apart = self.place[..., None, :] - center
+        offset = self.fit.direction.mT[..., None, :] + (self.fit.inverse / self.scale)[..., None, None] * apart
         return (((offset * self.rays).sum(-1) < 0) & self.used).any(-1) & self.fitted
 
     @property
@@ -311,10 +310,8 @@ def fit_views(
         moved = None if shared is None else shared_pixels(posed, shared, (place, ahead, inverse), used, scale)
         weight, variance = _weight(cov, noise, used, moved), 1.0
     apart = place[..., None, :] - center
-    lines = [
-        RelativeCamera(camera, turn, turn @ apart[..., c, :].mT)
-        for c, (camera, turn) in enumerate(zip(posed.cameras, posed.rotation, strict=True))
-    ]
+    each = zip(posed.cameras, posed.rotation, apart.unbind(-2), strict=True)
+    lines = [RelativeCamera(camera, turn, turn @ own.mT) for camera, turn, own in each]
     fit = most_likely(
         lines, scale, (ahead, inverse), pixels.flatten(-2).mT, fitted, weight, differentiated=differentiated,
         around=around,
@@ -340,11 +337,7 @@ def _height_row(ahead: Tensor, inverse: Tensor, scale: Tensor, stated: StatedHei
 
 
 def shared_pixels(
-    posed: PosedCameras,
-    shared: CommonErrors,
-    at: tuple[Tensor, Tensor, Tensor],
-    used: Tensor,
-    scale: Tensor,
+    posed: PosedCameras, shared: CommonErrors, at: tuple[Tensor, Tensor, Tensor], used: Tensor, scale: Tensor
 ) -> Tensor:
     """(K, 2 C, N) what each shared error moves in the pixels of points: anchor (N, 3), direction, inverse distance."""
     place, ahead, inverse = at
@@ -505,10 +498,6 @@ def errors_by_camera(rig: Rig) -> tuple[Tensor | None, Tensor | None, tuple[tupl
         # Cameras of one kind are computed together, with the same parameters.
         wanted = [tuple(sorted(set().union(*wanted)))] * len(rig)
     most = max(map(len, wanted))
-    rows = [
-        torch.nn.functional.pad(
-            torch.cat([root[:, rig.pose_columns(c)], lenses[c][:, list(own)]], 1), (0, most - len(own))
-        )
-        for c, own in enumerate(wanted)
-    ]
+    parts = [torch.cat([root[:, rig.pose_columns(c)], lenses[c][:, list(own)]], 1) for c, own in enumerate(wanted)]
+    rows = [torch.nn.functional.pad(part, (0, most - len(own))) for part, own in zip(parts, wanted, strict=True)]
     return torch.stack(rows, 1), root[:, -1], tuple(wanted)

@@ -92,9 +92,8 @@ class RigBand:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         # The curve's end at infinity is as far away as matters to an entrance pupil that moves.
-        self._inverse = torch.linspace(
-            0.0, 1.0 / (_NEAREST_BASELINES * float(rig.baseline)), _POINTS, dtype=torch.float64
-        ).clamp_min(1.0 / FAR)
+        nearest = _NEAREST_BASELINES * float(rig.baseline)
+        self._inverse = torch.linspace(0.0, 1.0 / nearest, _POINTS, dtype=torch.float64).clamp_min(1.0 / FAR)
 
     @torch.no_grad()
     def curve(self, side: Side, u: float, v: float) -> Curve:
@@ -174,9 +173,8 @@ def propose(rig: Rig, images: tuple[Gray, Gray], side: Side, u: float, v: float,
                      -rig.right_from_left_rotation.T @ rig.right_from_left_translation)  # fmt: skip
     there, return_way = (rig, back) if side == "left" else (back, rig)
     first, second = (torch.from_numpy(np.ascontiguousarray(image)) for image in images[:: 1 if side == "left" else -1])
-    options = MatchOptions(
-        max_off_line=min(max(1.0, 3.0 * band_sigma), 5.0), nearest=_NEAREST_BASELINES * float(rig.baseline)
-    )
+    off_line = min(max(1.0, 3.0 * band_sigma), 5.0)
+    options = MatchOptions(max_off_line=off_line, nearest=_NEAREST_BASELINES * float(rig.baseline))
     start = torch.tensor([[u, v]], dtype=torch.float64)
     try:
         found = match_points(there, first, second, start, options)

@@ -57,7 +57,7 @@ class Journal:
         self.path = path
         # Bytes that are whole lines: what follows them was not answered.
         self._end = 0
-        self._file = self._opened()
+        self._open()
 
     @property
     def state(self) -> marking.MarkingState:
@@ -137,7 +137,7 @@ class Journal:
             raise InputError("there is nothing to redo")
         return [*self._states, self._undone[-1]], self._undone[:-1]
 
-    def _opened(self) -> IO[bytes]:
+    def _open(self) -> None:
         try:
             # Without a buffer, which would keep what a full disk did not take.
             file = open(self.path, "a+b", buffering=0)  # noqa: SIM115
@@ -151,7 +151,6 @@ class Journal:
         except BaseException:
             file.close()
             raise
-        return file
 
     def _read(self, file: IO[bytes]) -> None:
         if not try_lock(file.fileno()):
@@ -258,9 +257,8 @@ def _named_rows(path: Path, header: str, columns: Sequence[str], required: str) 
 
 def places_text(survey: SurveyedPlaces) -> str:
     """The places as CSV that `read_survey` reads."""
-    return places_csv(
-        survey.columns, ([name, *place.at, place.sigma, place.sigma_up] for name, place in survey.places.items())
-    )
+    rows = ([name, *place.at, place.sigma, place.sigma_up] for name, place in survey.places.items())
+    return places_csv(survey.columns, rows)
 
 
 # The files of a session: marks, points and landmarks as CSV, rewritten after every action, and the undo log.
@@ -442,11 +440,9 @@ class Session:
 
 def marks_of(state: marking.MarkingState, kinds: tuple[marking.Kind, ...], *, single: bool = True) -> Marks:
     """Marks of the items of some kinds, with their covariance where both images have one."""
-    chosen = {
-        name: item
-        for name, item in state.items.items()
-        if item.kind in kinds and (item.left and item.right if not single else item.left or item.right)
-    }
+    enough = any if single else all
+    items = {name: item for name, item in state.items.items() if item.kind in kinds}
+    chosen = {name: item for name, item in items.items() if enough((item.left, item.right))}
 
     def pixels(side: marking.Side) -> Tensor:
         found = [item.mark(side) for item in chosen.values()]

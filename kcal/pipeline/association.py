@@ -86,9 +86,8 @@ def station_sights(
     for c, lens in enumerate(posed.cameras):
         own = torch.from_numpy(np.flatnonzero(camera == c)).to(ray.device)
         marks = pixels[own]
-        rays, valid = lens.unproject(
-            torch.stack([marks, marks + marks.new_tensor([1, 0]), marks + marks.new_tensor([0, 1])])
-        )
+        steps = marks.new_tensor([[0, 0], [1, 0], [0, 1]])[:, None]
+        rays, valid = lens.unproject(marks + steps)
         slope = (rays[1:] - rays[:1]).square().sum((0, -1)) / 2.0
         ray[own], there[own] = rays[0] @ posed.rotation[c], valid[0]
         wide[own] = (slope * (sigma**2 + common_variance(posed, common, c, ray[own]).amax(-1))).sqrt()
@@ -114,9 +113,8 @@ def near_lines(localize: Localizer, anchors: Sequence[Tensor], options: Associat
         pixels = torch.cat([some.flatten(0, 1) for some in anchors])
         lines, there = station_sights(localize, camera, pixels, options.box_sigma)
         gate, ranges = _SLACK * options.gate, (nearest / _MIDDLE, options.farthest * _MIDDLE)
-        for own, other in zip(
-            *(part.reshape(moments, -1) for part in np.split(np.arange(len(camera)), [count])), strict=True
-        ):
+        left, right = (part.reshape(moments, -1) for part in np.split(np.arange(len(camera)), [count]))
+        for own, other in zip(left, right, strict=True):
             first, second = near_in_angle(lines, own[there[own]], other[there[other]], gate, nearest)
             kept = in_range(lines, (first, second), gate, ranges)
             near[first[kept] // rows, first[kept] % rows, (second[kept] - count) % columns] = True
@@ -148,10 +146,9 @@ class PairCosts(NamedTuple):
 def fit_some(localize: Localizer, cameras: list[int], pixels: Tensor, seen: Tensor, noise: float) -> ViewsFit:
     """Points of pixels (N, C, 2) of some cameras, with all errors that each camera's marks share."""
     posed, common = localize.posed, localize.common
-    part = PosedCameras(
-        [posed.cameras[c] for c in cameras], posed.rotation[cameras], posed.center[cameras],
-        None if posed.up is None else posed.up[cameras], posed.bending,
-    )  # fmt: skip
+    lenses = [posed.cameras[c] for c in cameras]
+    up = None if posed.up is None else posed.up[cameras]
+    part = PosedCameras(lenses, posed.rotation[cameras], posed.center[cameras], up, posed.bending)
     if common is not None:
         common = CommonErrors(tuple(common.lens[c] for c in cameras), common.half[:, cameras], common.bending)
     return fit_views(part, pixels, seen, noise=noise, shared=common, differentiated=is_differentiated(pixels))
@@ -415,9 +412,8 @@ class PairBoxes(StatedModule):
         middles = [0.5 * (score.new_tensor(camera.size) - 1.0) for camera in (self.rig.left, self.rig.right)]
         seen = [middle.expand(*mask.shape, 2).index_put((moments, rows), pixel)
                 for middle, pixel in zip(middles, pixels.unbind(1), strict=True)]  # fmt: skip
-        return BoxPairs(
-            found.match, mask, score.index_put((moments, rows), (-0.5 * cost).exp()), found.ambiguous, *seen
-        )
+        score = score.index_put((moments, rows), (-0.5 * cost).exp())
+        return BoxPairs(found.match, mask, score, found.ambiguous, *seen)
 
 
 def _sound_boxes(name: str, boxes: Tensor, mask: Tensor | None, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -538,10 +534,9 @@ def _patches(image: Tensor, boxes: Tensor, samples: int) -> Tensor:
     middle, size = 0.5 * (boxes[:, :2] + boxes[:, 2:]), boxes[:, 2:] - boxes[:, :2]
     x = middle[:, :1] + at * size[:, :1]
     y = middle[:, 1:] + at * size[:, 1:]
-    grid = torch.stack(
-        [(2.0 * x / (width - 1) - 1.0)[:, None].expand(-1, samples, -1),
-         (2.0 * y / (height - 1) - 1.0)[:, :, None].expand(-1, -1, samples)], -1,
-    )  # fmt: skip
+    across = (2.0 * x / (width - 1) - 1.0)[:, None].expand(-1, samples, -1)
+    down = (2.0 * y / (height - 1) - 1.0)[:, :, None].expand(-1, -1, samples)
+    grid = torch.stack([across, down], -1)
     # One tall grid, because the image is the same for all.
     sampled = torch.nn.functional.grid_sample(
         image[None, None], grid.reshape(1, -1, samples, 2), padding_mode="border", align_corners=True

@@ -124,9 +124,8 @@ def meetings(lines: StationSights, rows: Ints, others: Ints, gate: float, neares
     kept = (squared < gate**2) & ~flat & (near > 0) & (far > 0)
     share = (spread[1] / both)[:, None]
     point = lines.center[a] + share * start + (1.0 - share) * end
-    return Meetings(
-        first[kept], second[kept], point[kept], np.sqrt(both[kept]) / crossing[kept], near[kept], squared[kept]
-    )
+    sigma = np.sqrt(both[kept]) / crossing[kept]
+    return Meetings(first[kept], second[kept], point[kept], sigma, near[kept], squared[kept])
 
 
 def near_in_angle(lines: StationSights, rows: Ints, others: Ints, gate: float, nearest: float) -> tuple[Ints, Ints]:
@@ -320,10 +319,9 @@ class Confirming:
             if c in trees:
                 # Marks of one camera are about as good as each other.
                 sigma = np.hypot(self.lines.wide(own[c][:1], away, c), meet.sigma) / away
-                apart, place = trees[c].query(
-                    np.column_stack([look, _ELSEWHERE * self.kind[meet.first]]),
-                    distance_upper_bound=self.gate * float(sigma.max(initial=0.0)) + 1e-12,
-                )
+                widest = self.gate * float(sigma.max(initial=0.0)) + 1e-12
+                wanted = np.column_stack([look, _ELSEWHERE * self.kind[meet.first]])
+                apart, place = trees[c].query(wanted, distance_upper_bound=widest)
                 squared = (apart / sigma) ** 2
                 hit = squared < self.gate**2
                 mark[hit] = own[c][place[hit]]
@@ -388,10 +386,9 @@ class Confirming:
                 near.append((np.full((len(marks), 1), -1), np.full((len(marks), 1), np.inf)))
                 continue
             # What the point would be, and how well known, without this camera.
-            across = _sideways(self.lines.ray[done.marks[:, c]])
-            weight = np.where(
-                done.marks[:, c] >= 0, _ALL_BUT / self.lines.wide(done.marks[:, c], away[:, c, 0], c) ** 2, 0.0
-            )
+            mark = done.marks[:, c]
+            across = _sideways(self.lines.ray[mark])
+            weight = np.where(mark >= 0, _ALL_BUT / self.lines.wide(mark, away[:, c, 0], c) ** 2, 0.0)
             spread = np.linalg.inv(done.normal - weight[:, None, None] * across)
             moved = (spread @ (weight[:, None, None] * across) @ lines[:, c, :, None])[..., 0]
             at = lines[:, c] + moved
@@ -400,10 +397,9 @@ class Confirming:
             wide = self.lines.wide(own[c][:1], away[:, c], c)
             noise = (side @ spread @ side + wide[..., None] ** 2 * np.eye(3)) / away[:, c, :, None] ** 2
             widest = np.sqrt(np.trace(noise, axis1=1, axis2=2).max(initial=0.0))
-            apart, place = trees[c].query(
-                np.column_stack([at, _ELSEWHERE * kind]), k=np.arange(min(_NEIGHBORS, len(own[c]))) + 1,
-                distance_upper_bound=self.gate * widest,
-            )  # fmt: skip
+            wanted = np.column_stack([at, _ELSEWHERE * kind])
+            neighbors = np.arange(min(_NEIGHBORS, len(own[c]))) + 1
+            apart, place = trees[c].query(wanted, k=neighbors, distance_upper_bound=self.gate * widest)
             there = np.isfinite(apart)
             number = np.where(there, own[c][np.where(there, place, 0)], -1)
             rest = self.lines.ray[number] - at[:, None]

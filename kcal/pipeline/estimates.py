@@ -190,6 +190,7 @@ class History:
         self._moments: dict[int, list[_Moment]] = {}
         self._priors: dict[int, tuple[Summary, Tensor]] = {}
         self._clock = torch.zeros(0)
+        # Of tracks, once they have one; several share a number if motion recognized the target.
         self.numbers: dict[int, int] = {}
 
     def predicted(self, keys: Sequence[int], prior: Summary, cross: Tensor, clock: Tensor) -> None:
@@ -210,10 +211,6 @@ class History:
             moment = _Moment(time, frame[which], home[which], beliefs.at(which), prior, cross, clock)
             self._moments.setdefault(key, []).append(moment)
         self._priors = {}
-
-    def confirmed(self, key: int, number: int) -> None:
-        """A track got its number; several may share one, if motion recognized the target."""
-        self.numbers[key] = number
 
     def smoothed(self, localize: Localizer, clock: Tensor, root: Tensor | None) -> list[SmoothedTrack]:
         """All confirmed tracks, with the clock as now known and a root of the covariance of the shared errors."""

@@ -259,32 +259,28 @@ class _Scene:
             both = both[self.kind[both[:, 0]] == self.kind[both[:, 1]]]
         if not len(both):
             return _Edges(both[:, 0], both[:, 1], *(np.zeros(0),) * 3)
-        found = pair_costs(
-            self.localize, torch.from_numpy(self.camera[both]), self.pixels[both], self.boxes[both], self.options,
-            self.options.nearest,
-        )  # fmt: skip
+        cameras, options = torch.from_numpy(self.camera[both]), self.options
+        found = pair_costs(self.localize, cameras, self.pixels[both], self.boxes[both], options, options.nearest)
         kept = found.cost.numpy() < self.options.gate**2
         return _Edges(both[kept, 0], both[kept, 1], *(value.numpy()[kept] for value in found))
 
     def _fitted(self, groups: list[tuple[int, ...]]) -> list[_Group]:
         """Groups of three views and more, fitted; one view that contradicts is left out."""
         good, gate = [], self.options.gate**2
+        cameras = list(range(len(self.own)))
         for _ in range(2):
             again: set[tuple[int, ...]] = set()
             for start in range(0, len(groups), _AT_ONCE):
                 part = groups[start : start + _AT_ONCE]
                 numbers = torch.tensor(part)
-                found = fit_some(
-                    self.localize, list(range(len(self.own))), self.pixels[numbers.clamp_min(0)], numbers >= 0,
-                    self.options.box_sigma,
-                )  # fmt: skip
+                pixels = self.pixels[numbers.clamp_min(0)]
+                found = fit_some(self.localize, cameras, pixels, numbers >= 0, self.options.box_sigma)
                 chi2, falls = found.misfits()
                 views = found.used.sum(-1)
                 ahead = found.fitted & (found.fit.inverse > 0) & ~found.behind(self.posed.center)
                 worst = falls.argmax(-1).tolist()
-                for group, value, count, there, one in zip(
-                    part, chi2.tolist(), views.tolist(), ahead.tolist(), worst, strict=True
-                ):
+                fits = zip(part, chi2.tolist(), views.tolist(), ahead.tolist(), worst, strict=True)
+                for group, value, count, there, one in fits:
                     if there and count > 2 and float(chi2_tail(value, 2 * count - 3)) > 1e-4:
                         good.append(_Group(group, (count - 1) * gate - value))
                     elif count > 3:
@@ -374,10 +370,8 @@ def read_moment(line: str | bytes, rig: Rig | Localizer, options: AssociationOpt
     if isinstance(content["left"], dict) and isinstance(content["right"], dict):
         if set(content) != {"left", "right"}:
             raise InputError("with detections, a line has left and right only; time is that of each")
-        left, right = (
-            Detections.read(orjson.dumps(content[side]), size=camera.size)
-            for side, camera in (("left", rig.left), ("right", rig.right))
-        )
+        sides = (content["left"], rig.left.size), (content["right"], rig.right.size)
+        left, right = (Detections.read(orjson.dumps(seen), size=size) for seen, size in sides)
         if left.time is None or right.time is None:
             raise InputError("detections of both images need a time")
         return Moment(left.time, pair_objects(rig, left, right, options=options))
@@ -466,8 +460,7 @@ def _pairs_of_line(content: dict[str, Any], pixel_sigma: float) -> Moment:
 
 def _table(values: Any, name: str, width: int) -> Tensor:
     rows = values if isinstance(values, list) else [None]
-    if not all(
-        isinstance(row, list) and len(row) == width and all(type(v) in (int, float) for v in row) for row in rows
-    ):
+    fine = (isinstance(row, list) and len(row) == width and all(type(v) in (int, float) for v in row) for row in rows)
+    if not all(fine):
         raise InputError(f"{name}: rows of {width} numbers are needed")
     return torch.tensor(rows, dtype=torch.float64).reshape(-1, width)

@@ -452,14 +452,12 @@ class ObjectDisparity(StatedModule):
         levels = (halves / _LARGEST_HALF).log2().ceil().clamp_min(0.0)
         for level in levels[finite].unique().tolist():
             chosen = finite[levels[finite] == level]
-            part = _Objects(
-                boxes[chosen], middle[chosen], starts[chosen], aims[chosen], None if masks is None else masks[chosen],
-                math.ceil(float(halves[chosen].max()) / 2**level), int(level),
-            )  # fmt: skip
+            own = None if masks is None else masks[chosen]
+            half = math.ceil(float(halves[chosen].max()) / 2**level)
+            part = _Objects(boxes[chosen], middle[chosen], starts[chosen], aims[chosen], own, half, int(level))
             done = self._match(left, right, part)
-            found = ObjectDisparities(*(
-                whole.index_put((chosen,), some) for whole, some in zip(found, done, strict=True)
-            ))  # fmt: skip
+            both = zip(found, done, strict=True)
+            found = ObjectDisparities(*(whole.index_put((chosen,), some) for whole, some in both))
         return found
 
     def _match(self, left: Tensor, right: Tensor, objects: _Objects) -> ObjectDisparities:
@@ -632,10 +630,9 @@ def pair_objects(
         good = done.status == int(MatchStatus.GOOD)
         pixels = torch.where(good[:, None], done.pixels, pixels)
         own, slope = noise[:2, :2], done.by_anchor
-        shared = torch.cat(
-            [torch.cat([own.expand_as(slope), own @ slope.mT], -1),
-             torch.cat([slope @ own, slope @ own @ slope.mT + done.covariance], -1)], -2,
-        )  # fmt: skip
+        upper = torch.cat([own.expand_as(slope), own @ slope.mT], -1)
+        lower = torch.cat([slope @ own, slope @ own @ slope.mT + done.covariance], -1)
+        shared = torch.cat([upper, lower], -2)
         covariance = torch.where(good[:, None, None], 0.5 * (shared + shared.mT), covariance)
     return ObjectViews.of_pairs(
         anchors,

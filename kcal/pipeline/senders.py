@@ -367,9 +367,8 @@ def _called(columns: PositionColumns, row: int) -> str:
 
 def _speed(columns: PositionColumns, row: int) -> list[str]:
     """The level speed and where it leads, where that is known to be more than nothing."""
-    east, north, east_sigma, north_sigma = (
-        float(columns.extras[f"velocity_{part}_mps"][row]) for part in ("east", "north", "east_sigma", "north_sigma")
-    )
+    parts = ("east", "north", "east_sigma", "north_sigma")
+    east, north, east_sigma, north_sigma = (float(columns.extras[f"velocity_{part}_mps"][row]) for part in parts)
     speed = math.hypot(east, north)
     sigma = math.hypot(east * east_sigma, north * north_sigma) / max(speed, 1e-9)
     if not speed > 2.0 * sigma:

@@ -357,9 +357,8 @@ def track_columns(tracks: Tracks, sequence: int, stations: Rig | None = None) ->
         extras["told_from"] = [stations.names[camera] for camera in state.anchor.tolist()]
         extras["cameras"] = [camera_list(stations, row) for row in tracks.seen.tolist()]
     names, status = [f"track {number}" for number in tracks.number], state.status.numpy()
-    return PositionColumns(
-        names, status, [_REASONS[int(code)] for code in status], numbers, extras, state.anchor.numpy()
-    )
+    reasons = [_REASONS[int(code)] for code in status]
+    return PositionColumns(names, status, reasons, numbers, extras, state.anchor.numpy())
 
 
 def _texts(values: torch.Tensor, ok: torch.Tensor) -> list[str]:
@@ -572,10 +571,8 @@ class Stream:
         # Files of two cameras of one mast tell all from the left one.
         stations = None if self.run.centers is None else self.tracker.localize.rig
         columns = track_columns(tracks, sequence, stations)
-        parts = [
-            appended(path.suffix.lower(), self.run, columns, when, first=size == 0)
-            for path, size in zip(self.ledger.outputs, self.ledger.place.sizes, strict=True)
-        ]
+        files = zip(self.ledger.outputs, self.ledger.place.sizes, strict=True)
+        parts = [appended(path.suffix.lower(), self.run, columns, when, first=size == 0) for path, size in files]
         self.ledger.append(parts, moment.time, offset)
         for sender in self.senders:
             sender.send(columns, self.run, when)

@@ -202,9 +202,8 @@ def track_steps(localize: Localizer, lasting_px: float) -> TrackSteps:
         found = imm.innovations(beliefs, there, timing.at(which))
         fit = imm.fit_of(found, root)
         density = fit.log_density[0] + _EXPLAINED * local.seen.sum(0)
-        return Scores(
-            there, found.effect[..., 0, :], found.value[:, 0], found.noise[..., 0, :], fit.squared[0], density
-        )
+        effect, noise = found.effect[..., 0, :], found.noise[..., 0, :]
+        return Scores(there, effect, found.value[:, 0], noise, fit.squared[0], density)
 
     def place(beliefs: imm.Beliefs, frame: Tensor, home: Tensor, root: Tensor | None, which: Tensor) -> TrackStates:
         summary = beliefs.at(which).summary()
@@ -248,14 +247,12 @@ def _compile_all(made: TrackSteps, cameras: int, nothing: imm.Beliefs, root: Ten
     timing = imm.Timing(new(cameras, _PAIRS), new(clocks, 3, _PAIRS), new(clocks, _PAIRS))
     beliefs = imm.Beliefs(*(torch.nn.functional.pad(value, (0, _TRACKS), value=1.0) for value in nothing))
     frame = torch.eye(3).to(unit)[..., None].expand(3, 3, _TRACKS)
-    home = torch.zeros(_TRACKS, dtype=torch.long, device=unit.device)
+    sizes = (_TRACKS, _MATCHES, _MATCHES, _TAKEN, _TOLD)
+    home, track, pair, taken, told = (torch.zeros(size, dtype=torch.long, device=unit.device) for size in sizes)
     beliefs = made.move(beliefs, frame[2], new(9, models), new(()))
     merged, looks = made.look(beliefs, frame, home, root)
     made.near(looks, seen, timing, new(()))
     # Each its own tensor: the same one twice would become a rule.
-    track, pair, taken, told = (
-        torch.zeros(size, dtype=torch.long, device=unit.device) for size in (_MATCHES, _MATCHES, _TAKEN, _TOLD)
-    )
     scores = made.score(merged, frame, home, seen, timing, root, track, pair)
     made.take(beliefs.at(taken), scores.seen.at(taken), timing.at(taken), root)
     made.place(beliefs, frame, home, root, told)
@@ -629,7 +626,7 @@ class Tracker:
                     # Forgotten below: its number lives on.
                     old.last = -math.inf
                 if self.history is not None:
-                    self.history.confirmed(track.key, track.number)
+                    self.history.numbers[track.key] = track.number
         limits = [self.options.forget_after_s if t.number else 0.5 * self.options.lose_after_s for t in self.records]
         kept = [i for i, track in enumerate(self.records) if self.time - track.last <= limits[i]]
         if len(kept) < len(self.records):
@@ -639,10 +636,8 @@ class Tracker:
 
     def _recognized(self, new: int) -> int | None:
         """The lost track that a new one continues, if there is one and only one."""
-        lost = [
-            i for i, track in enumerate(self.records)
-            if track.number and not self._is_told(track) and track.last < self.records[new].first
-        ]  # fmt: skip
+        named = [i for i, track in enumerate(self.records) if track.number and not self._is_told(track)]
+        lost = [i for i in named if self.records[i].last < self.records[new].first]
         if not lost:
             return None
         which = torch.tensor(lost, device=self.frame.device)

@@ -324,9 +324,8 @@ def gallery_figure(observations: Observations, failed: Sequence[FailedImage] = (
     down = max(1, math.ceil(len(tiles) / across))
     width, height = observations.image_size
     names = {one.name for one in failed[:_MOST_FAILED]}
-    listed = [
-        f"{failure.name}: {failure.reason}"[:130] for failure in observations.failures if failure.name not in names
-    ]
+    unshown = (failure for failure in observations.failures if failure.name not in names)
+    listed = [f"{failure.name}: {failure.reason}"[:130] for failure in unshown]
     title = f"{len(observations.views)} views"
     if standing_out:
         title += "; the first stands out" if standing_out == 1 else f"; the first {standing_out} stand out"

@@ -135,17 +135,12 @@ def _pose_findings(camera: Camera, rotation: Tensor, middle: Tensor) -> list[Fin
             "principal point cannot be told apart"
         )
         found.append(Finding("roll", "doubt", text, "turn the board by 90 degrees in some views"))
-    distance = middle.norm(dim=-1)
-    if float(distance.max()) < _DEPTH * float(distance.min()):
-        text = (
-            f"the board was always at the same distance ({float(distance.min()):.2g} to {float(distance.max()):.2g} m)"
-        )
+    near, far = map(float, middle.norm(dim=-1).aminmax())
+    if far < _DEPTH * near:
+        text = f"the board was always at the same distance ({near:.2g} to {far:.2g} m)"
         found.append(Finding("depth", "doubt", text, "show the board near and far"))
     if not found:
-        text = (
-            f"tilts up to {float(tilts.max()):.0f}°, rolls within {span:.0f}°, distances "
-            f"{float(distance.min()):.2g} to {float(distance.max()):.2g} m"
-        )
+        text = f"tilts up to {tilts.max():.0f}°, rolls within {span:.0f}°, distances {near:.2g} to {far:.2g} m"
         found.append(Finding("poses", "fine", text))
     return found
 
@@ -270,19 +265,13 @@ def fault_of_views(
 def _patterns_finding(found: trust.Examination) -> Finding:
     """Residuals that are not noise, where no harm of it was measured."""
     structure = found.structure
-    what = (
-        f"neighboring corners have a correlation of {structure.neighbors:.2f}"
-        if structure.neighbors > _NEIGHBORS
-        else f"averages over parts of the image are {math.sqrt(structure.image):.1f} times what noise leaves"
-    )
+    what = f"averages over parts of the image are {math.sqrt(structure.image):.1f} times what noise leaves"
+    if structure.neighbors > _NEIGHBORS:
+        what = f"neighboring corners have a correlation of {structure.neighbors:.2f}"
     agree = bool(found.halves) and _halves_agree(found.halves)
-    checked = (
-        "halves of the views agree within the error bars, which allow for it"
-        if agree
-        else "halves of the views do not show that the error bars allow for it"
-    )
+    how = "agree within the error bars, which" if agree else "do not show that the error bars"
     action = "for smaller error bars use a flat, stiff board on a stand, with fixed focus and zoom"
-    text = f"residuals are not only noise: {what}; {checked}"
+    text = f"residuals are not only noise: {what}; halves of the views {how} allow for it"
     return Finding("patterns", "note" if agree else "doubt", text, action)
 
 

@@ -95,9 +95,8 @@ def synchrony(rig: Rig, board_points: Tensor, pixels: Tensor) -> Synchrony:
     sight = torch.nn.functional.normalize(center, dim=-1)
     away = center - center_left
     away = away - (away * sight).sum(-1, keepdim=True) * sight
-    found = Synchrony(
-        len(pixels), math.sqrt(float(squares.median()) / _MEDIAN), float(away.norm(dim=-1).square().median().sqrt())
-    )
+    ratio = math.sqrt(float(squares.median()) / _MEDIAN)
+    found = Synchrony(len(pixels), ratio, float(away.norm(dim=-1).square().median().sqrt()))
     if len(pixels) < _FEWEST_PAIRS:
         return found
     velocity = torch.gradient(center, dim=0)[0]
@@ -211,11 +210,7 @@ def _inherited(rig: Rig, cameras: Sequence[Verdict]) -> list[Finding]:
     for name, findings in told or [(word, (*stored_findings(camera),)) for word, camera in named_cameras(rig)]:
         for finding in findings:
             found.setdefault(finding, []).append(name)
-    return [
-        dataclasses.replace(finding, cameras=tuple(names))
-        for finding, names in found.items()
-        if finding.severity != "fine"
-    ]
+    return [dataclasses.replace(one, cameras=tuple(names)) for one, names in found.items() if one.severity != "fine"]
 
 
 def _rig_answer(

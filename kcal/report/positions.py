@@ -79,9 +79,8 @@ def positions_figure(located: Located, truth: Tensor | None = None, figure: Figu
     shown = [i for i, position in enumerate(located.positions) if position.range_low_m is not None]
     scale = _scale_of(located, true_enu)
     place = f"{located.place.lat:.6f}°, {located.place.lon:.6f}°, heading {located.heading_deg:g}°"
-    figure = figures.framed_figure(
-        13.0, 6.8, f"{located.count_note}, from {place}", _interval_notes(located), into=figure
-    )
+    title = f"{located.count_note}, from {place}"
+    figure = figures.framed_figure(13.0, 6.8, title, _interval_notes(located), into=figure)
     plan, ranges = figure.subplots(1, 2, width_ratios=[1.45, 1.0])
     _draw_map(plan, located, true_enu, shown, scale)
     _draw_ranges(ranges, located, true_enu, shown)
@@ -460,9 +459,8 @@ def siting_figure(
     (left, right), (low, high) = panels[0].get_xlim(), panels[0].get_ylim()
     figure.set_figheight(min(7.0 * (high - low) / (right - left), 9.0) + 1.8)
     lengths = FuncFormatter(lambda level, _: length_text(level, digits=2))
-    figures.add_color_bar(
-        colored, panels[-1], "standard deviation of a position on the map", ticks=levels, format=lengths
-    )
+    label = "standard deviation of a position on the map"
+    figures.add_color_bar(colored, panels[-1], label, ticks=levels, format=lengths)
     patches = [Patch(color=_SINGLE, label="one site sees it: a bearing only"), Patch(color=_HIDDEN, label="hidden")]
     marks = axes.plot([], [], "^", color="white", markeredgecolor="black", markersize=9, label="site")
     if ranked:

@@ -135,9 +135,8 @@ def with_common_errors(
     for side in (0, 1):
         total.index_add_(0, near[:, side], part * weight[near[:, 1 - side]])
     total = total / weight
-    counted = (total / variance)[:, None, None] * (
-        scale[:, None, None] * stated + floor[:, None, None] * torch.eye(2, dtype=torch.float64)
-    )
+    noise = scale[:, None, None] * stated + floor[:, None, None] * torch.eye(2, dtype=torch.float64)
+    counted = (total / variance)[:, None, None] * noise
     return list(counted.split([len(own) for own in pixels]))
 
 

@@ -107,9 +107,7 @@ def _both_ways(
         ratio: the second best must be farther than the best over this.
     """
     first, second = (own.descriptors for own in points)
-    orders = [torch.arange(len(own)) for own in (first, second)] if near is None else [
-        side.turn.argsort() for side in near[:2]
-    ]  # fmt: skip
+    orders = [side.turn.argsort() for side in near[:2]] if near else [torch.arange(len(own)) for own in (first, second)]
     best = [torch.full((len(own),), -1, dtype=torch.long) for own in (first, second)]
     column_score = torch.full((len(second),), -math.inf)
     clear = torch.zeros(len(first), dtype=torch.bool)

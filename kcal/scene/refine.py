@@ -133,9 +133,8 @@ def _patch(
     Nine places of a patch are projected; a parabola goes through them, since a lens hardly bends within a patch.
     """
     nodes = HALF * grid_of((1, 1), middle.device)
-    places, seen = plane_pixels(
-        camera, planes, middle[:, None, None] + planes.step[:, None, None, None] * nodes, rotation
-    )
+    column = middle[:, None, None] + planes.step[:, None, None, None] * nodes
+    places, seen = plane_pixels(camera, planes, column, rotation)
     t = torch.arange(-HALF, HALF + 1, dtype=torch.float64) / HALF
     values = torch.stack([0.5 * t * (t - 1.0), 1.0 - t.square(), 0.5 * t * (t + 1.0)], 1)
     steps = torch.stack([t - 0.5, -2.0 * t, t + 0.5], 1) / HALF
@@ -185,9 +184,8 @@ def still_there(rig: Rig, image: Tensor, others: tuple[Tensor, Tensor], pixels: 
     change = (found.right - left) - (pixels[there, 1] - pixels[there, 0])
     change = change - change[found.good].median(0).values if bool(found.good.any()) else change
     sigma = (found.covariance + covariance[there]).diagonal(dim1=-2, dim2=-1).sqrt()
-    stays = torch.where(
-        (change.abs() <= _SIGMAS * sigma + _SLACK).all(-1), int(Stillness.STILL), int(Stillness.ELSEWHERE)
-    )
+    still = (change.abs() <= _SIGMAS * sigma + _SLACK).all(-1)
+    stays = torch.where(still, int(Stillness.STILL), int(Stillness.ELSEWHERE))
     status[there] = torch.where(found.good, stays, status[there])
     return status
 

@@ -272,7 +272,8 @@ def _checked_attitude(
     heading, pitch, roll = attitude(torch.from_numpy(fit.rotation.T.copy()))
     widened = math.sqrt(variance_factor(fit.chi2, fit.freedom))
     turn = _angles_by_turn(fit.rotation)
-    sigma = widened * np.sqrt(np.diag(turn @ fit.covariance @ turn.T))
+    total = np.diag(turn @ fit.covariance @ turn.T)
+    sigma = widened * np.sqrt(total)
     agreeing = float(fit.used.mean())
     few = f"{100 * agreeing:.0f} % of the skyline's clear columns agree in the best heading, {heading:.1f} degrees"
     below = (
@@ -308,7 +309,6 @@ def _checked_attitude(
     upright = np.where(columns.sigma > 0, seen.sigma / columns.sigma, 1.0)
     expected[at] = np.where(seen.known, columns.pixel[:, 1] + seen.residual / np.maximum(upright, 0.05), np.nan)
     used[at] = fit.used
-    total = np.diag(turn @ fit.covariance @ turn.T)
     back = fit.rotation.T
     return SkylineAttitude(
         rotation=fit.rotation,
@@ -489,9 +489,8 @@ def _joined(
     # Only what moves by turns, and by what is not known of places and lenses, is kept: the rest says how well the
     # skylines fit, which each image has told.
     moves = [white[:, : 3 * count], white[:, 3 * count : 6 * count] * center_sigma.numpy().reshape(-1)]
-    moves += [
-        white[:, a:b] @ fits.lens_errors(camera) for camera, a, b in zip(cameras, begin[:-1], begin[1:], strict=True)
-    ]
+    by_lens = np.split(white, begin, axis=1)[1:-1]
+    moves += [own @ fits.lens_errors(camera) for own, camera in zip(by_lens, cameras, strict=True)]
     basis, size, _ = np.linalg.svd(np.column_stack(moves), full_matrices=False)
     compact = basis[:, size > _TELLS].T @ white
     return SkylineSource(

@@ -320,16 +320,8 @@ def fit_rotation(
     gain = np.linalg.lstsq(rows[:, :3], np.linalg.inv(root), rcond=None)[0]
     by_part = {name: gain @ part @ gain.T for name, part in parts.items()}
     left = rows[:, 3]
-    return SkylineFit(
-        rotation,
-        used,
-        below,
-        binned,
-        sum(by_part.values(), np.zeros((3, 3))),
-        by_part,
-        float(left @ left),
-        len(left) - 3,
-    )
+    covariance = sum(by_part.values(), np.zeros((3, 3)))
+    return SkylineFit(rotation, used, below, binned, covariance, by_part, float(left @ left), len(left) - 3)
 
 
 def _columns_that_agree(seen: Comparison, errors: SkylineErrors, most_below: float) -> Bools:

@@ -197,13 +197,11 @@ def _refined_border(light: Floats, path: NDArray[np.int64], noise: Floats) -> Bo
     row = path - 0.5 + place
     level = median_filter(row, _MEDIAN, mode="nearest")
     trend = np.abs(np.gradient(level))
-    broken = (np.abs(row - level) > _BREAK + _MEDIAN * trend) | (
-        np.abs(np.diff(row, prepend=row[0])) > _BREAK + 2 * trend
-    )
+    jump = np.abs(np.diff(row, prepend=row[0]))
+    broken = (np.abs(row - level) > _BREAK + _MEDIAN * trend) | (jump > _BREAK + 2 * trend)
     good &= uniform_filter1d(broken.astype(np.float64), 2 * _BESIDE + 1, mode="nearest") < 0.5 / (2 * _BESIDE + 1)
-    return Border(
-        row=np.where(good, row, np.nan), sigma=np.where(good, sigma, np.nan), step=step, size=(columns, rows)
-    )  # fmt: skip
+    row, sigma = (np.where(good, values, np.nan) for values in (row, sigma))
+    return Border(row=row, sigma=sigma, step=step, size=(columns, rows))
 
 
 def _fit_steps(

@@ -131,11 +131,9 @@ def _night_sky(levels: Floats, *, quantum: float) -> tuple[Floats, Floats]:
     spread = 1.4826 * np.median(np.abs(tiles - level[:, None, :, None]), (1, 3))
     spread = np.hypot(np.maximum(spread, 0.3 * np.median(spread)), quantum / np.sqrt(12.0))
     where = np.meshgrid(*[(np.arange(n) - (_TILE - 1) / 2) / _TILE for n in (height, width)], indexing="ij")
-    smooth = [
-        ndimage.map_coordinates(ndimage.median_filter(values, 3), where, order=1, mode="nearest")
-        for values in (level, spread)
-    ]
-    return smooth[0], np.maximum(smooth[1], 1e-9)
+    even = (ndimage.median_filter(values, 3) for values in (level, spread))
+    level, spread = (ndimage.map_coordinates(values, where, order=1, mode="nearest") for values in even)
+    return level, np.maximum(spread, 1e-9)
 
 
 def _windowed(boxes: Floats, around: NDArray[np.int64]) -> tuple[Floats, Floats]:

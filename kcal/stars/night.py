@@ -398,17 +398,14 @@ def _on_earth(among: NamedStars, catalog: night_sky.StarCatalog, camera: Camera)
     used = on_ground.star[on_ground.star >= 0]
     covariance = on_ground.covariance + _by_clock(view) + _by_air(view, catalog, used)
     _, _, roll = attitude(on_ground.rotation.T)
-    doubts = [
-        f"the camera would be rolled by {roll:.0f}°: unless it lies on its side, place or time is wrong"
-    ] * (abs(roll) > _ON_ITS_SIDE)  # fmt: skip
+    rolled = f"the camera would be rolled by {roll:.0f}°: unless it lies on its side, place or time is wrong"
     part = _part(catalog, used)
     vacuum = view.directions(part, night_sky.Air(hectopascal=0.0))
     sigma = blurred[on_ground.star >= 0]
     doubt = refraction_doubt(on_ground, sigma, torch.from_numpy(there[used]), torch.from_numpy(vacuum), camera)
-    if doubt is not None:
-        doubts.append(doubt)
+    told = tuple(filter(None, (rolled if abs(roll) > _ON_ITS_SIDE else None, doubt)))
     return dataclasses.replace(
-        among, attitude=on_ground, directions=there, on_earth=True, covariance=covariance, warnings=tuple(doubts)
+        among, attitude=on_ground, directions=there, on_earth=True, covariance=covariance, warnings=told
     )
 
 

@@ -280,9 +280,8 @@ def observed_directions(
     place = math.radians(origin.lon), math.radians(origin.lat), origin.height
     with _quiet(erfa):
         # Once for all stars: 0.1 ms, which `atco13` would take for each.
-        context, _ = erfa.apco13(
-            *_julian(erfa, time), dut1, *place, 0.0, 0.0, air.hectopascal, air.celsius, air.humidity, 0.6
-        )
+        weather = air.hectopascal, air.celsius, air.humidity
+        context, _ = erfa.apco13(*_julian(erfa, time), dut1, *place, 0.0, 0.0, *weather, 0.6)
         ra, dec = erfa.atciq(*_columns(catalog), 0.0, 0.0, context)
         azimuth, zenith, *_ = erfa.atioq(ra, dec, context)
     # `unit_vectors` counts from the first axis; azimuths count from north, the second.

@@ -501,9 +501,8 @@ def history_table(path: str | Path) -> Any:
     kinds = dict.fromkeys(COLUMNS, pyarrow.float64()) | dict.fromkeys(("rig", "note"), pyarrow.string())
     kinds |= dict.fromkeys(("left_features", "right_features", "matches"), pyarrow.int64())
     try:
-        table = read_csv(
-            pyarrow.py_buffer(data[: data.rfind(b"\n") + 1]), convert_options=ConvertOptions(column_types=kinds)
-        )
+        whole = pyarrow.py_buffer(data[: data.rfind(b"\n") + 1])
+        table = read_csv(whole, convert_options=ConvertOptions(column_types=kinds))
     except pyarrow.ArrowInvalid as error:
         raise FileError(f"{path}: no history of `kcal watch`, or a damaged one: {error}") from error
     if not set(COLUMNS) <= set(table.column_names):
@@ -601,10 +600,9 @@ def _parsed_row(where: str, cells: dict[str, str], fingerprint: str) -> HistoryR
             seen=told[:2], lasting=torch.tensor(every[-3], dtype=torch.float64),
             between=between, between_covariance=_from_upper(both, 5, told[2]), matched=told[2],
         )  # fmt: skip
-        return HistoryRow(
-            every[-2], look, (int(cells["left_features"]), int(cells["right_features"])), int(cells["matches"]),
-            every[-1] if warm else math.nan, cells["note"],
-        )  # fmt: skip
+        features = int(cells["left_features"]), int(cells["right_features"])
+        temperature = every[-1] if warm else math.nan
+        return HistoryRow(every[-2], look, features, int(cells["matches"]), temperature, cells["note"])
     except ValueError as error:
         raise FileError(f"{where}: a number is damaged ({error}); remove that line") from error
 

@@ -141,9 +141,8 @@ def with_look(reference: FixedFeatures, seen: Tensor, off: Tensor) -> FixedFeatu
     found = reference.found + weight * (seen.double() - reference.found)
     # The mean of those looks at which it was found.
     own = (weight / found.clamp_min(weight))[:, None] * (off - reference.off)
-    return dataclasses.replace(
-        reference, looks=looks, found=found, off=reference.off + torch.where(seen[:, None], own, 0.0)
-    )
+    off = reference.off + torch.where(seen[:, None], own, 0.0)
+    return dataclasses.replace(reference, looks=looks, found=found, off=off)
 
 
 def renewed(reference: FixedFeatures, camera: Camera, image: Gray, turn: Tensor, covariance: Tensor) -> FixedFeatures:

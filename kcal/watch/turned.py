@@ -28,7 +28,7 @@ from kcal.lens.pose import fit_turn, rotation_from_vector, seen_turned, vector_f
 from kcal.lens.projection import FAR
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig
 from kcal.locate.budget import measured_ranges, right_turned, usual_ranges
-from kcal.locate.marks import Marks
+from kcal.locate.marks import PAIR, Marks
 from kcal.locate.mounting import attitude
 from kcal.locate.stereo import sight_lines
 from kcal.solve.lm import LMOptions
@@ -186,7 +186,6 @@ def _typical(turn: CameraTurn) -> float:
 # long range is all that matters (0.01° of relative yaw is 436 m at 5 km with 10 m of baseline). Only rotations are
 # unknown here.
 
-_NAMES = ("left", "right")
 _SOLVER = LMOptions(residual_floor=1e-8)
 
 
@@ -418,7 +417,7 @@ def measure_drift(
     if features is not None:
         features = dataclasses.replace(features, pixels=features.pixels[:, 2:])
     cameras = (rig.left, rig.right)
-    data = RigData(cameras=cameras, names=_NAMES, features=features, landmarks=landmarks)
+    data = RigData(cameras=cameras, names=PAIR, features=features, landmarks=landmarks)
     unknowns = held(cameras).and_refraction(*refraction) if loose else held(cameras)
     work = adjustment.Adjustment(data, start, unknowns, 1.0, turning=[loose, True], moving=[False] * 2)
     mask = _telling(data)
@@ -433,7 +432,7 @@ def measure_drift(
     known = RigSolution(problem, state, fit.variance)
     covariance, determined = known.of(known.relative_rows(0, 1))
     if not bool(determined[:3].all()):
-        left_open = "; ".join(known.open_directions(_NAMES, absolute=True))
+        left_open = "; ".join(known.open_directions(PAIR, absolute=True))
         raise DegenerateError(f"drift: what was seen does not determine how the cameras have turned ({left_open})")
     relative = state.rotation[1] @ state.rotation[0].T
     drift = vector_from_rotation(relative @ rig.right_from_left_rotation.T)
@@ -513,10 +512,10 @@ def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift
     """How the cameras have turned since the marks of then, with the left camera's attitude then, if it is known."""
     then, now = features.pixels.unflatten(1, (2, 2)).unbind(1)
     sigma = features.each_sigma.unflatten(1, (2, 2)).norm(dim=1)
-    found = camera_turns((rig.left, rig.right), _NAMES, then, now, sigma)
+    found = camera_turns((rig.left, rig.right), PAIR, then, now, sigma)
     items = []
     for i, feature in enumerate(features.names):
-        off = {name: float(turn.off[i].norm()) for name, turn in zip(_NAMES, found.each, strict=True)}
+        off = {name: float(turn.off[i].norm()) for name, turn in zip(PAIR, found.each, strict=True)}
         sigmas = [length / one for length, one in zip(off.values(), sigma[i].tolist(), strict=True)]
         sigmas = [one for one in sigmas if math.isfinite(one)]
         off = {name: length for name, length in off.items() if math.isfinite(length)}
@@ -525,14 +524,12 @@ def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift
         typical = math.hypot(*sigmas) / math.sqrt(2 * len(sigmas)) if sigmas else math.inf
         over, used = float(found.over_limit[i]), bool(found.used[i])
         items.append(ItemResidual(
-            source="features", name=feature, pixels=tuple(off.get(name) for name in _NAMES), sigmas=typical,
+            source="features", name=feature, pixels=tuple(off.get(name) for name in PAIR), sigmas=typical,
             over_limit=over, used=used, reason="" if used else reason,
         ))  # fmt: skip
-    vectors, covariances = zip(*((turn.vector, turn.covariance) for turn in found.each), strict=True)
-    return drift_of_turns(
-        rig, torch.cat(vectors), torch.block_diag(*covariances), cam_from_local, items=tuple(items),
-        variance=found.variance,
-    )  # fmt: skip
+    turns = torch.cat([turn.vector for turn in found.each])
+    covariance = torch.block_diag(*(turn.covariance for turn in found.each))
+    return drift_of_turns(rig, turns, covariance, cam_from_local, items=tuple(items), variance=found.variance)
 
 
 def drift_of_turns(

@@ -342,9 +342,7 @@ class Webhook:
         """Try to send what waits."""
         if not self._waiting:
             return
-        request = urllib.request.Request(
-            self.address, self._waiting, {"Content-Type": "application/json"}, method="POST"
-        )
+        request = urllib.request.Request(self.address, self._waiting, {"Content-Type": "application/json"})
         try:
             with urllib.request.urlopen(request, timeout=_PATIENCE):
                 self._waiting = b""
@@ -488,10 +486,8 @@ class Watcher:
         warm = math.nan if self._temperatures is None else self._temperatures.at(time)
         self._warmth = warm if math.isnan(self._warmth) else self._warmth
         counts = found.sides[0].found, found.sides[1].found
-        row = past.warmed(
-            past.HistoryRow(time, found.look, counts, found.matches, warm, found.note), self._warmth,
-            self._rows[-1].look.kelvin if self._rows else None,
-        )  # fmt: skip
+        seen = past.HistoryRow(time, found.look, counts, found.matches, warm, found.note)
+        row = past.warmed(seen, self._warmth, self._rows[-1].look.kelvin if self._rows else None)
         self._sides = found.sides[0].reference, found.sides[1].reference
         self.watched.take(row, _KEPT_ROWS)
         self._rows.append(row)
