@@ -478,20 +478,13 @@ def _turned_by_errors(
     From the normal equations with lenses and places free as well: where these are off, turns give way.
     """
     count, lenses = len(root), root[:, : sum(rig.sizes)].split(rig.sizes, 1)
-    nothing = torch.zeros(count, dtype=torch.float64)
-    errors = dataclasses.replace(
-        held(work.data.cameras),
-        cameras=tuple(own.T for own in lenses),
-        board=nothing[None, :][:0],
-        begin=nothing,
-        known=nothing == 0.0,
-        labels=("",) * count,
-    )
+    errors = held(work.data.cameras).and_effects(*[""] * count)
+    errors = dataclasses.replace(errors, cameras=tuple(own.T for own in lenses), by_effects=None)
     if (light := work.unknowns.by_refraction) is not None:
         errors = errors.and_refraction(work.unknowns.refraction, float(light))
     start = Start(rotation=work.state.rotation, center=work.state.center)
     wide = adjustment.Adjustment(work.data, start, errors, 1.0, turning=turning, moving=[True] * 2)
-    wide.state = work.state._replace(unknown=torch.cat([nothing, work.state.unknown]))
+    wide.state = work.state._replace(unknown=torch.cat([torch.zeros(count).double(), work.state.unknown]))
     wide.widened = work.widened
     problem = wide.problem(mask)
     scaled, scale = problem.linearize(wide.part(mask)).information()
@@ -503,9 +496,8 @@ def _turned_by_errors(
         moved = root[:, rig.pose_columns(camera)][:, :3] @ local_from_rig.T
         pull = pull + information[found, slot] @ moved.T
     by_error = -torch.linalg.solve(information[found][:, found], pull)[len(errors) - count :]
-    out = by_error.new_zeros(2, count, 3)
-    out[list(turning)] = by_error.unflatten(0, (-1, 3)).transpose(1, 2)
-    return out
+    turned = by_error.unflatten(0, (-1, 3)).transpose(1, 2)
+    return torch.cat([turned.new_zeros(2 - len(turned), count, 3), turned])
 
 
 def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift:
