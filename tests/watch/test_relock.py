@@ -114,6 +114,7 @@ def test_an_exact_mounting_gets_the_errors_of_the_check_and_none_is_refused() ->
         check_rig(rig, landmarks=marks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("held", [0.0, 1.0])
 def test_errors_of_lenses_are_in_the_attitudes_then_and_now(held: float) -> None:
     """Of a rig that landmarks had turned to make up for its principal points (1), and of one that knew nothing of them.

@@ -73,6 +73,7 @@ def of_copies(count: int, seed: int, copies: int) -> float:
     )
 
 
+@pytest.mark.slow
 def test_copies_of_corners_disperse_as_much_as_there_are() -> None:
     # Of independent corners chance explains the scatter as a rule: two standard deviations of a skewed distribution.
     assert sum(of_copies(12, seed, 1) > 1.0 for seed in range(20)) <= 3
@@ -82,6 +83,7 @@ def test_copies_of_corners_disperse_as_much_as_there_are() -> None:
     assert float(found.std()) < 3.0
 
 
+@pytest.mark.slow
 def test_error_bars_hold_where_views_see_bent_boards() -> None:
     """A board that bends anew in each view, by 2 mm: noise of the corners alone makes intervals too small."""
     errors = []

@@ -222,6 +222,7 @@ def positions(*cameras: int) -> tuple[MeasuredPosition, ...]:
     return tuple(MeasuredPosition(camera=c, point=CENTER[c], sigma=torch.full((3,), 0.02).double()) for c in cameras)
 
 
+@pytest.mark.slow
 def test_many_cameras_of_features_and_baselines_alone() -> None:
     """Directions are tried camera by camera: of five cameras in all combinations they would be 1,296 starts.
 
