@@ -56,7 +56,10 @@ def located(heading: float = 300.0) -> tuple[Located, torch.Tensor]:
 @functools.cache
 def landmarks_rig(wide: bool = False, wrong: bool = True) -> RigResult:
     """Two cameras east and west of each other that look north, and eight landmarks, of which one is wrong."""
-    lens = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
+    # All landmarks are inside.
+    size = (16000, 1080) if wide else (1920, 1080)
+    center = 0.5 * (size[0] - 1), 0.5 * (size[1] - 1)
+    lens = Camera.build(focal=(1600, 1600), center=center, size=size, model="pinhole")
     turn = enu_from_cam(0.0).T
     places = tensor(
         [-20, 80, 1], [15, 90, 5], [-60, 200, 3], [55, 240, -9], [-120, 420, 12], [150, 520, 8], [-9, 610, 20],
