@@ -112,7 +112,8 @@ def _slip(function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str,
         given = inspect.signature(function).bind(*args, **kwargs)
     except TypeError:  # of missing arguments: Python says which
         return ""
-    single = {n: v for n, v in given.arguments.items() if given.signature.parameters[n].kind not in (_MANY, _NAMED)}
+    kinds = {name: parameter.kind for name, parameter in given.signature.parameters.items()}
+    single = {name: value for name, value in given.arguments.items() if kinds[name] not in (_MANY, _NAMED)}
     owner = function.__qualname__.removesuffix(".__init__")
     found = _misfit(owner, single, function.__annotations__, function.__globals__)
     # Options are records, whose fields nobody has looked at.

@@ -332,7 +332,9 @@ class Keys(Mapping[str, Any]):
         for key in (key for key in self.content if key not in self.read):
             value, name = self.content[key], re.sub("^cam(?:era)?(?=[a-z])", "", bare(key))
             name = (BEFORE.fullmatch(name) or ("", "", name))[2]
-            found = flat([part for part in value if flat(part)] if isinstance(value, list) else value)
+            found = whole = flat(value)
+            if whole is None and isinstance(value, list):
+                found = flat([part for part in value if flat(part)])
             if isinstance(value, Mapping) and found is None and not OTHER.search(name):
                 yield from Keys(value)._unread(f"{where}{key}.")
             if not found or not any(found):
@@ -340,7 +342,7 @@ class Keys(Mapping[str, Any]):
             if OTHER.search(name) and not (len(found) == 1 and re.fullmatch("[prt][12]|f", name)):
                 continue
             if _LENS.search(name) or 4 <= len(found) <= 14:
-                if isinstance(value, list) and flat(value) is None:
+                if whole is None:
                     raise ValueError(f"{where}{key} must be numbers")
                 shape = f"{len(found)} numbers" if len(found) > 1 else f"{found[0]:g}"
                 raise ValueError(

@@ -501,7 +501,9 @@ def as_disparity(disparity: Tensor | ArrayLike, like: Tensor) -> Tensor:
             "disparity: floating point is needed, got whole numbers; those of cv2.StereoSGBM are sixteenths of a "
             "pixel: divide them by 16.0"
         )
-    return as_points("disparity", (given if given is disparity else given.to(like.device))[..., None], 1, like)[..., 0]
+    if given is not disparity:
+        given = given.to(like.device)
+    return as_points("disparity", given[..., None], 1, like)[..., 0]
 
 
 def _rectified_frame(rig: Rig) -> Tensor:

@@ -126,11 +126,8 @@ def true_from_grid(grid_heading_deg: float, origin: Origin, crs: str) -> float:
         grid_north = pyproj.Proj(system).get_factors(origin.lon, origin.lat, errcheck=True).meridian_convergence
     except ProjError as error:
         raise InputError(f"{crs}: {system.name} does not reach {origin.lat:g}, {origin.lon:g}") from error
-    # Areas may contain the antimeridian, or all longitudes.
-    if (area := system.area_of_use) and not (
-        area.south <= origin.lat <= area.north
-        and (origin.lon - area.west) % 360 <= ((area.east - area.west) % 360 or 360)
-    ):
+    area = system.area_of_use
+    if area is not None and not _lies_within(area.bounds, origin):
         warnings.warn(
             f"{crs}: {system.name} is made for latitudes {area.south:g} to {area.north:g} and longitudes {area.west:g} "
             f"to {area.east:g}, not for {origin.lat:g}, {origin.lon:g}, where its grid north is {grid_north:.2f}° from "
@@ -139,6 +136,13 @@ def true_from_grid(grid_heading_deg: float, origin: Origin, crs: str) -> float:
             stacklevel=2,
         )
     return math.fmod(grid_heading_deg + grid_north, 360.0)
+
+
+def _lies_within(bounds: tuple[float, float, float, float], origin: Origin) -> bool:
+    """Whether a place is inside west, south, east and north bounds, across the antimeridian or all around, too."""
+    west, south, east, north = bounds
+    width = (east - west) % 360 or 360
+    return south <= origin.lat <= north and (origin.lon - west) % 360 <= width
 
 
 # Circular error probable of positions whose error ellipse is long, and skewed along the line of sight.

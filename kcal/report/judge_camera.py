@@ -269,9 +269,11 @@ def _patterns_finding(found: trust.Examination) -> Finding:
     if structure.neighbors > _NEIGHBORS:
         what = f"neighboring corners have a correlation of {structure.neighbors:.2f}"
     agree = bool(found.halves) and _halves_agree(found.halves)
-    how = "agree within the error bars, which" if agree else "do not show that the error bars"
+    checked = "halves of the views do not show that the error bars allow for it"
+    if agree:
+        checked = "halves of the views agree within the error bars, which allow for it"
     action = "for smaller error bars use a flat, stiff board on a stand, with fixed focus and zoom"
-    text = f"residuals are not only noise: {what}; halves of the views {how} allow for it"
+    text = f"residuals are not only noise: {what}; {checked}"
     return Finding("patterns", "note" if agree else "doubt", text, action)
 
 

@@ -18,7 +18,7 @@ from kcal.calibrate.rig.problem import RigSolution, goodness_of_fit
 from kcal.calibrate.rig.result import records
 from kcal.calibrate.rig.source import Start, typical_ratio
 from kcal.calibrate.rig.sources import RigData
-from kcal.calibrate.rig.unknowns import held
+from kcal.calibrate.rig.unknowns import by_errors, held
 from kcal.checks import as_points, beyond_chance, chi2_quantile, variance_factor
 from kcal.errors import DegenerateError, InputError
 from kcal.gaussian import half_of_covariance
@@ -313,9 +313,8 @@ class Drift:
         if stands is not None and self.cam_from_local is not None and self.attitude_covariance is not None:
             heading, pitch, roll = attitude(self.cam_from_local.T)
             stands = dataclasses.replace(stands, heading_deg=heading, pitch_deg=pitch, roll_deg=roll)
-            more.append(
-                pad(half_of_covariance(self.attitude_covariance) @ self.cam_from_local, (rig.quantities - 4, 1))
-            )
+            half = half_of_covariance(self.attitude_covariance) @ self.cam_from_local
+            more.append(pad(half, (rig.quantities - 4, 1)))
         new.mounting = stands
         # The same number of shared errors at every time, for filters.
         more = [pad(half, (0, 0, 0, most - len(half))) for half, most in zip(more, (6, 3), strict=False)]
@@ -419,7 +418,8 @@ def measure_drift(
     cameras = (rig.left, rig.right)
     data = RigData(cameras=cameras, names=PAIR, features=features, landmarks=landmarks)
     unknowns = held(cameras).and_refraction(*refraction) if loose else held(cameras)
-    work = adjustment.Adjustment(data, start, unknowns, 1.0, turning=[loose, True], moving=[False] * 2)
+    turning = [loose, True]
+    work = adjustment.Adjustment(data, start, unknowns, 1.0, turning=turning, moving=[False] * 2)
     mask = _telling(data)
     reasons = dict.fromkeys((~mask).nonzero()[:, 0].tolist(), "too few of the images have a mark of it")
     if int(mask.sum()) < 2:
@@ -441,7 +441,7 @@ def measure_drift(
     compared = covariance[:3, :3]
     spreads, standing = alone, rig.relative_root
     if root is not None:
-        now = _turned_by_errors(work, mask, rig, root, [loose, True], rotation.T)
+        now = _turned_by_errors(work, mask, rig, root, turning, rotation.T)
         then = torch.stack([-root[:, rig.pose_columns(c)][:, 3:] @ rig.rotation[c].T for c in (0, 1)])
         changed = now - then
         spreads = [spread + each.T @ each for spread, each in zip(alone, changed, strict=True)]
@@ -473,13 +473,9 @@ def measure_drift(
 def _turned_by_errors(
     work: adjustment.Adjustment, mask: Tensor, rig: Rig, root: Tensor, turning: Sequence[bool], local_from_rig: Tensor
 ) -> Tensor:
-    """(2, K, 3) how the cameras are found to be turned, about their own axes, by each of K errors of the rig.
-
-    From the normal equations with lenses and places free as well: where these are off, turns give way.
-    """
+    """(2, K, 3) how the cameras are found to be turned, about their own axes, by each of K errors of the rig."""
     count, lenses = len(root), root[:, : sum(rig.sizes)].split(rig.sizes, 1)
-    errors = held(work.data.cameras).and_effects(*[""] * count)
-    errors = dataclasses.replace(errors, cameras=tuple(own.T for own in lenses), by_effects=None)
+    errors = by_errors(work.data.cameras, [own.T for own in lenses])
     if (light := work.unknowns.by_refraction) is not None:
         errors = errors.and_refraction(work.unknowns.refraction, float(light))
     start = Start(rotation=work.state.rotation, center=work.state.center)
@@ -488,6 +484,7 @@ def _turned_by_errors(
     wide.widened = work.widened
     problem = wide.problem(mask)
     scaled, scale = problem.linearize(wide.part(mask)).information()
+    # Normal equations with lenses and places free as well: where these are off, turns give way.
     information = scaled / scale / scale[:, None]
     turns = [torch.arange(slot.start, slot.stop) for slot in problem.turn if slot is not None]
     found = torch.cat([torch.arange(count, len(errors)), *turns])
@@ -619,9 +616,12 @@ def check_rig(rig: Rig, *, features: Features | None = None, landmarks: Landmark
         if stands.covariance is not None:
             # Light that was held straight stays so; otherwise another day has another coefficient.
             refraction = stands.refraction, REFRACTION_SIGMA if bool(stands.covariance[6, 6]) else 0.0
-    known = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
-    known.covariance = rig.covariance
-    root = rig.root if landmarks is not None else known.root
+    root = rig.root
+    if landmarks is None:
+        # The left camera holds the frame: what is not known of its place and attitude does not count.
+        alone = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
+        alone.covariance = rig.covariance
+        root = alone.root
     return measure_drift(rig, features=features, landmarks=landmarks, pose=pose, root=root, refraction=refraction)
 
 

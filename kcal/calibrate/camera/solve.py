@@ -485,11 +485,12 @@ def _uncertainty(
     count, residuals = plain.shared_size + 6 * len(state.translation), plain.residual_count + plain.prior_count
     variance = float(noise_variance(linear, residuals, count))
     dispersion = dispersion_of(plain, state, variance)
-    if dispersion > 1.0:
+    variance *= dispersion
+    if known and dispersion > 1.0:
         # Of priors is known how much they count.
         known = [dataclasses.replace(term, weight=term.weight * math.sqrt(dispersion)) for term in known]
         plain = solution.problem_for(observations.pixels(), observations.covariances(), loss, known)
-        linear, variance = plain.linearize(state), variance * dispersion
+        linear = plain.linearize(state)
     found = uncertainty_of(linear, variance)
     if not found.computed or not variance > 0 or not len(plain.free):
         return _Uncertainty(found, None, dispersion)

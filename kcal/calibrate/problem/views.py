@@ -444,6 +444,7 @@ def dispersion_of(problem: BoardProblem, state: BoardState, variance: float) -> 
     Where boards bend, cameras move or a lens differs from its model, residuals repeat within a view, and a view counts
     for as many corners as it has though it has fewer independent ones. The derivatives of each view's χ² by lens and
     board then scatter more from view to view than its information says, and variances are too small by that factor.
+    (`kcal.calibrate.hybrid.evidence.overdispersion` is of lenses with priors, from the sum over all views alone.)
 
     Args:
         problem: with corners alone, or with priors, which do not count.
@@ -454,8 +455,10 @@ def dispersion_of(problem: BoardProblem, state: BoardState, variance: float) -> 
         R. Wedderburn, "Quasi-likelihood functions", Biometrika 61 (1974); per view, as in the variance of clustered
         data, K.-Y. Liang and S. Zeger, Biometrika 73 (1986).
     """
+    if not variance > LEAST_NOISE**2:
+        return 1.0
     rows = problem.off_poses(state)[:, [*problem.moving.tolist(), -1]]
-    if not variance > LEAST_NOISE**2 or not bool(rows.isfinite().all()):
+    if not bool(rows.isfinite().all()):
         return 1.0
     flat = rows.transpose(0, 1).flatten(1).T
     change, _, known = whitened(flat[:, :-1], flat[:, -1])

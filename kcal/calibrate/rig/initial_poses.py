@@ -152,19 +152,25 @@ def _starts(known: _Known, tried: list[int]) -> list[Start]:
     """The known poses, with each camera of `tried` in all six directions from another one."""
     starts = [Start(*_stacked(known))]
     for camera in tried:
-        starts = [moved for start in starts for moved in around(start, camera)[:-1]]
+        starts = [moved for start in starts for moved in around(start, camera)]
     return starts
 
 
 def around(start: Start, camera: int) -> list[Start]:
-    """A start with a camera in all six directions from another one, and with all cameras on the other side of that."""
+    """A start with a camera in all six directions from another one."""
     other = 0 if camera != 0 else 1
-    away = start.center - start.center[other]
-    places = torch.linalg.vector_norm(away[camera]) * torch.cat([start.rotation[other], -start.rotation[other]])
+    length = torch.linalg.vector_norm(start.center[camera] - start.center[other])
+    places = start.center[other] + length * torch.cat([start.rotation[other], -start.rotation[other]])
     at = torch.tensor([camera])
-    moved = [away.index_copy(0, at, place[None]) for place in places]
-    # With far points the whole rig and its mirror image fit alike; only what is in front of the cameras tells.
-    return [start._replace(center=start.center[other] + each) for each in (*moved, -away)]
+    return [start._replace(center=start.center.index_copy(0, at, place[None])) for place in places]
+
+
+def mirrored(start: Start) -> Start:
+    """A start with all cameras on the other side of the first one.
+
+    With far points the whole rig and its mirror image fit alike; only what is in front of the cameras tells.
+    """
+    return start._replace(center=2.0 * start.center[0] - start.center)
 
 
 def _in_all_places(data: RigData, starts: list[Start]) -> list[Start]:

@@ -28,7 +28,7 @@ from kcal.calibrate.rig.explanations import (
     refuse_same_camera,
     without_behind,
 )
-from kcal.calibrate.rig.initial_poses import InitialPoses, around, first_poses
+from kcal.calibrate.rig.initial_poses import InitialPoses, around, first_poses, mirrored
 from kcal.calibrate.rig.pairs import Pair, evenly, paired_boards, pose_alone
 from kcal.calibrate.rig.result import Reasons, RigResult, records
 from kcal.calibrate.rig.source import Start
@@ -113,7 +113,8 @@ def robust_solution(initial: InitialPoses, mask: Tensor, unknowns: SharedUnknown
             break
         before = best.cost
         for camera in initial.tried:
-            best = best_of([initial.with_boards(start) for start in around(best.start, camera)], best)
+            moved = [*around(best.start, camera), mirrored(best.start)]
+            best = best_of([initial.with_boards(start) for start in moved], best)
     work, here = best.work, possible(best.work, mask)
     work.unknowns = unknowns
     work.fit_corners(here, robust=True)

@@ -116,6 +116,12 @@ def held(cameras: Sequence[Camera]) -> SharedUnknowns:
     )
 
 
+def by_errors(cameras: Sequence[Camera], errors: Sequence[Tensor]) -> SharedUnknowns:
+    """K unknowns that are standard normal beforehand, each of which moves the parameters (5 + P, K) of all cameras."""
+    found, _ = held(cameras)._and(*[""] * errors[0].shape[1], known=True)
+    return dataclasses.replace(found, cameras=tuple(errors))
+
+
 def free(cameras: Sequence[Camera], names: Sequence[str]) -> SharedUnknowns:
     """All parameters of all cameras; nothing is known of them.
 
