@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from types import EllipsisType
 from typing import NamedTuple
 
 import torch
@@ -74,39 +74,43 @@ def center_covariance(
     Returns:
         (B, N, 2, 2) px².
     """
-    gain = torch.einsum("bnij,bnjyx->bniyx", inverse.to(residual), jacobian * weight[:, :, None])
-    outer = torch.einsum("bniyx,bnjyx->bnij", gain, gain)  # G Gᵀ
-    smeared = torch.einsum("bnij,bnjyx->bniyx", outer, jacobian)
-    moving, white = gain[:, :, :2], outer[..., :2, :2]
     odd, pair = _odd(residual, weight, center)
-    # (1 - J G)(1 - J G)ᵀ beside the 1 is J at one pixel times `smeared - gain` at the other, less G times J.
-    weights = pair[:, :, None]
-    ahead, behind = torch.cat([jacobian, -gain], 2) * weights, torch.cat([smeared - gain, jacobian], 2) * weights
-    odd = pair * odd
-
-    def found_and_made(down: int, right: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Weighted sums over pairs of pixels: products found, products that fitting makes of white noise, and pairs."""
-        here, there = _pixel_pairs(down, right)
-        made = 2.0 * (ahead[here] * behind[there]).sum((-3, -2, -1))  # twice: all of it is odd
-        return (odd[here] * odd[there]).sum((-2, -1)), made, (pair[here] * pair[there]).sum((-2, -1))
-
-    found, made, count = found_and_made(0, 0)
+    # In one row of pixels, zeros between lines and patches keep those `apart` from meeting pixels of others.
+    width = residual.shape[-1] + _CORRELATED
+    odd, pair, weight, jacobian = (
+        torch.nn.functional.pad(values, (0, _CORRELATED, 0, _CORRELATED)).flatten(-2)
+        for values in (pair * odd, pair, weight, jacobian)
+    )
+    gain = inverse.to(residual) @ (jacobian * weight[..., None, :])
+    outer = gain @ gain.mT  # G Gᵀ
+    white = outer[..., :2, :2]
+    # (1 - J G)(1 - J G)ᵀ beside the 1 is J at one pixel times `G Gᵀ J - G` at the other, less G times J.
+    ahead = torch.cat([jacobian, -gain], -2) * pair[..., None, :]
+    behind = torch.cat([outer @ jacobian - gain, jacobian], -2) * pair[..., None, :]
+    # Weighted sums over pixels: what was found, what fitting makes of white noise (twice: all of it is odd), and pairs.
+    found, made, count = odd.square().sum(-1), 2.0 * (ahead * behind).sum((-2, -1)), pair.square().sum(-1)
     freedom = (count + made).clamp_min(1.0)
     common = _sum_usable(found, usable) / _sum_usable(freedom, usable).clamp_min(1.0)
     known = torch.where(usable.sum(-1) >= 2, _SHARED_PIXELS, 0.0)[:, None]
     noise = (found + known * common[:, None]) / (freedom + known)
-    scale = 1.0 / torch.where(noise > 0, noise, 1.0)
     enough = _sum_usable(count, usable) >= _MIN_PIXELS
-    covariance = white.clone()
-    for down in range(_CORRELATED + 1):
-        for right in range(-_CORRELATED if down else 1, _CORRELATED + 1):
-            found, made, count = found_and_made(down, right)
-            correlation = _sum_usable(found * scale - made, usable) / _sum_usable(count, usable).clamp_min(1.0)
-            correlation = torch.where(enough, correlation, 0.0)
-            here, there = _pixel_pairs(down, right)
-            cross = torch.einsum("bniyx,bnjyx->bnij", moving[here], moving[there])
-            covariance = covariance + correlation[:, None, None, None] * (cross + cross.transpose(-1, -2))
-    return noise.clamp_min(least_noise)[..., None, None] * _bounded(covariance.double(), white.double())
+    # The same sums over pixels `apart`, for the usable corners of each image together.
+    whiten = torch.where(usable & (noise > 0), noise, math.inf).rsqrt()
+    odd, pair = (odd * whiten[..., None]).flatten(1), (pair * usable[..., None]).flatten(1)
+    ahead, behind = (ahead * usable[..., None, None]).flatten(1), behind.flatten(1)
+    moving = gain[..., :2, :]
+    smeared = torch.zeros_like(moving)
+    for down, right in itertools.product(range(_CORRELATED + 1), range(-_CORRELATED, _CORRELATED + 1)):
+        if (apart := down * width + right) > 0:  # each pair of pixels once
+            found, made, count = (
+                torch.einsum("bk,bk->b", here[:, :-apart], there[:, apart:])
+                for here, there in ((odd, odd), (ahead, behind), (pair, pair))
+            )
+            correlation = torch.where(enough, (found - 2.0 * made) / count.clamp_min(1.0), 0.0)
+            smeared[..., :-apart] += correlation[:, None, None, None] * moving[..., apart:]
+    cross = moving @ smeared.mT
+    covariance = (white + cross + cross.mT).double()
+    return noise.clamp_min(least_noise)[..., None, None] * _bounded(covariance, white.double())
 
 
 def _sum_usable(values: Tensor, usable: Tensor) -> Tensor:
@@ -128,15 +132,6 @@ def _odd(residual: Tensor, weight: Tensor, center: Tensor) -> tuple[Tensor, Tens
 
     pair = torch.minimum(weight, opposite(weight)) * inside
     return (residual - opposite(residual)) * 0.5**0.5, pair
-
-
-def _pixel_pairs(down: int, right: int) -> tuple[tuple[EllipsisType | slice, ...], tuple[EllipsisType | slice, ...]]:
-    """Indices of all pixels that have another one `down` rows below and `right` columns beside, and of that one."""
-    rows = slice(None, -down or None), slice(down, None)
-    columns = (
-        (slice(None, -right or None), slice(right, None)) if right >= 0 else (slice(-right, None), slice(None, right))
-    )
-    return (..., rows[0], columns[0]), (..., rows[1], columns[1])
 
 
 def _bounded(covariance: Tensor, white: Tensor) -> Tensor:
@@ -166,7 +161,9 @@ MIN_RADIUS = 2.5  # pixels: fewer would not determine ten parameters
 # The next line is left out where it is more sigmas of blur from the window's rim: 3e-4 of the contrast.
 REACH = 3.5
 _FIRST_STEPS, _STEPS = 4, 20
-_CONVERGED = 1e-4  # pixels: the last step is shorter; in float64 a tenth of it
+_PIXELS = 1 << 15  # in the windows of the corners that are fitted together
+_COARSE_RADIUS = 8.0  # pixels: from here on every fourth pixel is enough for the first steps
+_CONVERGED = 1e-5  # pixels: the next step would be shorter; in float64 a tenth of it
 _FLOOR = 1e-7  # of the scaled normal matrix: what float32 leaves of it
 
 
@@ -230,94 +227,122 @@ def fit_crossings(
     flat_side = side.reshape(-1)
     radius = (SHARE * flat_side).clamp(MIN_RADIUS, MAX_RADIUS)
     window, levels = cut_windows(image, base, offset, radius)
-    first, crosses = _start(window)
+    coarse = window.coarse() if float(radius.min()) >= _COARSE_RADIUS else window
+    first, crosses = _start(coarse)
     nothing = torch.zeros_like(first[:, :2])
     curves = curvatures(bend, first) if bend is not None else nothing
     prior = RampPrior.of(first, nothing, nothing[:, 0], nothing[:, 0])
     # A few steps are enough to estimate the illumination of the board and which lines reach into windows.
-    parameters, cost, converged = _levenberg_marquardt(first, _FitInputs(window, curves, prior, None), _FIRST_STEPS)
-    usable = crosses & torch.isfinite(cost)
+    inputs = _FitInputs(coarse, curves, prior, None)
+    fit = _fitted(first, inputs, torch.arange(len(first), device=first.device), _FIRST_STEPS)
+    usable = crosses & torch.isfinite(fit.cost)
     lines = None
     near = torch.zeros_like(crosses)
     if around is not None:
-        beside = neighbor_lines(around, parameters)
-        blur = parameters[:, 4].exp().clamp(max=0.5 * flat_side)
+        beside = neighbor_lines(around, fit.parameters)
+        blur = fit.parameters[:, 4].exp().clamp(max=0.5 * flat_side)
         near = usable & (beside.distance.amin((-2, -1)) - radius < REACH * blur)
         if bool(near.any()):
             # Markers may leave less than half a square free; the window stays inside that.
             free = flat_side >= 0.95 * torch.linalg.vector_norm(around.step, dim=-1).nan_to_num(math.inf).amin(-1)
             wide = (WIDE_SHARE * flat_side).clamp(MIN_RADIUS, MAX_RADIUS)
             window, levels = cut_windows(image, base, offset, torch.where(near & free, wide, radius))
-            lines = beside.distances(parameters, window.where)
+            lines = beside.distances(fit.parameters, window.where)
             lines = LineDistances(lines.distance, lines.turn * near[:, None, None, None])
     inputs = _FitInputs(window, curves, prior, lines)
     # With lines each step is twice the work, so only corners near one get them. These are fitted twice, because only
     # the first of the two fits makes the illumination well determined.
+    whole = window.levels.new_zeros(len(first), PARAMETERS, window.levels.shape[-1])
+    variance = fit.cost / coarse.weight.sum(-1)
+    fit = fit._replace(residual=torch.zeros_like(window.levels), jacobian=whole)
     for group, with_lines in ((~near, False), (near, True), (near, True)):
         some = group.nonzero()[:, 0]
         if not len(some):
             continue
-        light = light_at(parameters, window, curves, lines, usable.reshape(side.shape))
-        place = base + parameters[:, :2].reshape(base.shape)
+        light = light_at(fit.parameters, window, curves, lines, usable.reshape(side.shape))
+        place = base + fit.parameters[:, :2].reshape(base.shape)
         slope, error = light_slope(light, place, side, usable.reshape(side.shape))
-        inputs = inputs._replace(prior=RampPrior.of(parameters, slope, error, cost / window.weight.sum(-1)))
-        chosen = (inputs if with_lines else inputs._replace(lines=None)).of(some)
-        done = _levenberg_marquardt(parameters[some], chosen, _STEPS)
-        parameters, cost, converged = (
-            value.index_copy(0, some, new) for value, new in zip((parameters, cost, converged), done, strict=True)
-        )
+        inputs = inputs._replace(prior=RampPrior.of(fit.parameters, slope, error, variance))
+        done = _fitted(fit.parameters, inputs if with_lines else inputs._replace(lines=None), some, _STEPS)
+        fit = _Fit(*(value.index_copy(0, some, new) for value, new in zip(fit, done, strict=True)))
+        variance = fit.cost / window.weight.sum(-1)
+    parameters = fit.parameters
     between = (parameters[:, 2] - parameters[:, 3]).sin().abs()
-    crosses = crosses & (between > math.sin(MIN_ANGLE)) & torch.isfinite(cost)
-    noise, covariance = _noise_and_covariance(
-        parameters, inputs, (crosses & converged).reshape(side.shape), least_noise
-    )
-    converged = converged & torch.isfinite(covariance).all(-1).all(-1)
+    crosses = crosses & (between > math.sin(MIN_ANGLE)) & torch.isfinite(fit.cost)
+    noise, covariance = _noise_and_covariance(fit, inputs, (crosses & fit.converged).reshape(side.shape), least_noise)
+    converged = fit.converged & torch.isfinite(covariance).all(-1).all(-1)
     center = _with_gradient(parameters, inputs, levels) if is_differentiated(levels) else parameters[:, :2]
     return CrossingFit(center, parameters, window, noise, covariance, crosses, converged, near)
 
 
-def _levenberg_marquardt(parameters: Tensor, inputs: _FitInputs, steps: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Minimize for all corners at once: parameters, cost, and whether the last step was small."""
-    result = parameters.clone()
-    result_cost = torch.full_like(parameters[:, 0], math.inf)
-    result_last = result_cost.clone()
+class _Fit(NamedTuple):
+    """Where Levenberg-Marquardt is with each corner: parameters, the cost there, and whether it converged.
+
+    Residuals (M, K), their derivatives (M, 10, K), normal equations and cost are those before the last step.
+    """
+
+    parameters: Tensor
+    cost: Tensor
+    normal: Tensor
+    gradient: Tensor
+    residual: Tensor
+    jacobian: Tensor
+    converged: Tensor
+
+    def of(self, some: Tensor) -> _Fit:
+        return _Fit(*(value[some] for value in self))
+
+
+def _fitted(parameters: Tensor, inputs: _FitInputs, some: Tensor, steps: int) -> _Fit:
+    """Fit some of the corners, a few at a time: what they take stays in a core's cache."""
+    parts = some.split(max(1, _PIXELS // inputs.window.levels.shape[-1]))
+    done = [_levenberg_marquardt(parameters[part], inputs.of(part), steps) for part in parts]
+    return _Fit(*(torch.cat(values) for values in zip(*done, strict=True))) if len(done) > 1 else done[0]
+
+
+def _levenberg_marquardt(parameters: Tensor, inputs: _FitInputs, steps: int) -> _Fit:
+    """Minimize for all corners at once, until the next step would be tiny.
+
+    As steps near the minimum shrink by the same factor, the last one is taken without looking where it ends.
+    """
     at = torch.arange(len(parameters), device=parameters.device)  # the corners that still move
-    damping = torch.full_like(result_cost, 1e-3)
-    last = result_last.clone()
-    normal, gradient, cost = _normal_equations(parameters, inputs)
+    fit = _evaluated(parameters, inputs)
+    damping, last = torch.full_like(fit.cost, 1e-3), torch.zeros_like(fit.cost)
     # What rounding of the levels may do to a cost.
     power = (inputs.window.weight * inputs.window.levels.square()).sum(-1).double()
     rounding = torch.finfo(inputs.window.levels.dtype).eps * power.sqrt()
     still = _CONVERGED if inputs.window.levels.dtype == torch.float32 else 0.1 * _CONVERGED
+    done = []
     for _ in range(steps):
-        scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).rsqrt()
-        scaled = normal * scale[:, :, None] * scale[:, None, :]
+        scale = fit.normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-12).rsqrt()
+        scaled = fit.normal * scale[:, :, None] * scale[:, None, :]
         scaled = scaled + (_FLOOR + damping)[:, None, None] * torch.eye(PARAMETERS, device=scaled.device)
         factor, _ = torch.linalg.cholesky_ex(scaled)
-        step = -torch.cholesky_solve((gradient * scale)[..., None], factor)[..., 0] * scale
+        step = -torch.cholesky_solve((fit.gradient * scale)[..., None], factor)[..., 0] * scale
         step = torch.nan_to_num(step, posinf=0.0, neginf=0.0)
-        trial = parameters + step
-        trial_normal, trial_gradient, trial_cost = _normal_equations(trial, inputs)
-        better = trial_cost <= cost + rounding * cost.sqrt()
+        trial = fit.parameters + step
         length = torch.linalg.vector_norm(step[:, :2], dim=-1)
-        # A rejected tiny step is rounding at the minimum; a rejected long one is not.
-        last = torch.where(better | (length < still), length, last)
-        parameters = torch.where(better[:, None], trial, parameters)
-        normal = torch.where(better[:, None, None], trial_normal, normal)
-        gradient = torch.where(better[:, None], trial_gradient, gradient)
-        cost = torch.where(better, trial_cost, cost)
-        damping = torch.where(better, damping * 0.1, damping * 10.0).clamp(1e-9, 1e6)
-        go = (last >= still).nonzero()[:, 0]
-        if 2 * len(go) < len(at):  # go on with those that have not converged
-            result[at], result_cost[at], result_last[at] = parameters, cost, last
-            if not len(go):
+        ends = length * (length / last.clamp_min(1e-12)).clamp_max(1.0) < still
+        if bool(ends.any()):
+            done.append((at[ends], fit._replace(parameters=trial, converged=ends).of(ends)))
+            go = (~ends).nonzero()[:, 0]
+            at, inputs, fit = at[go], inputs.of(go), fit.of(go)
+            trial, damping, length, last, rounding = (value[go] for value in (trial, damping, length, last, rounding))
+            if not len(at):
                 break
-            at, inputs = at[go], inputs.of(go)
-            parameters, normal, gradient, cost, damping, last, rounding = (
-                value[go] for value in (parameters, normal, gradient, cost, damping, last, rounding)
+        tried = _evaluated(trial, inputs)
+        better = tried.cost <= fit.cost + rounding * fit.cost.sqrt()
+        if not bool(better.all()):
+            chosen = (
+                torch.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+                for new, old in zip(tried, fit, strict=True)
             )
-    result[at], result_cost[at], result_last[at] = parameters, cost, last
-    return result, result_cost, result_last < _CONVERGED
+            tried = _Fit(*chosen)
+        fit, last = tried, torch.where(better, length, last)
+        damping = torch.where(better, damping * 0.1, damping * 10.0).clamp(1e-9, 1e6)
+    done.append((at, fit))
+    order = torch.cat([corners for corners, _ in done]).argsort()
+    return _Fit(*(torch.cat(values) for values in zip(*(part for _, part in done), strict=True))).of(order)
 
 
 def _start(window: CornerWindow) -> tuple[Tensor, Tensor]:
@@ -350,31 +375,29 @@ def _least_squares(design: Tensor, values: Tensor, weight: Tensor) -> Tensor:
     return torch.nan_to_num(torch.linalg.solve_ex(normal.double(), right.double())[0][..., 0])
 
 
-def _normal_equations(parameters: Tensor, inputs: _FitInputs) -> tuple[Tensor, Tensor, Tensor]:
-    """Normal matrix, gradient and cost of the weighted residuals and the prior."""
+def _evaluated(parameters: Tensor, inputs: _FitInputs) -> _Fit:
+    """Normal equations of the weighted residuals and the prior."""
     window, prior = inputs.window, inputs.prior
     levels, jacobian = crossing(parameters, window.where, inputs.bend, inputs.lines)
     weight, miss = prior.diagonal(), parameters - prior.value()
-    residual = levels - window.levels
-    weighted = jacobian * window.weight[:, None]
-    normal = (weighted @ jacobian.mT).double() + torch.diag_embed(weight)
-    gradient = (weighted @ residual[..., None])[..., 0].double() + weight * miss
-    cost = (window.weight * residual**2).sum(-1).double() + (weight * miss**2).sum(-1)
+    rows = torch.cat([jacobian, (levels - window.levels)[:, None]], 1)
+    sums = ((rows * window.weight[:, None]) @ rows.mT).double()
+    normal = sums[:, :-1, :-1] + torch.diag_embed(weight)
+    gradient = sums[:, :-1, -1] + weight * miss
+    cost = sums[:, -1, -1] + (weight * miss**2).sum(-1)
     # Of a blur of 0 levels are finite, and their derivatives are not.
     sound = torch.isfinite(cost + gradient.sum(-1))
-    return normal, gradient, torch.where(sound, cost, math.inf)
+    cost = torch.where(sound, cost, math.inf)
+    return _Fit(parameters, cost, normal, gradient, rows[:, -1], rows[:, :-1], torch.zeros_like(sound))
 
 
-def _noise_and_covariance(
-    parameters: Tensor, inputs: _FitInputs, usable: Tensor, least_noise: float
-) -> tuple[Tensor, Tensor]:
+def _noise_and_covariance(fit: _Fit, inputs: _FitInputs, usable: Tensor, least_noise: float) -> tuple[Tensor, Tensor]:
     window, prior = inputs.window, inputs.prior
-    levels, jacobian = crossing(parameters, window.where, inputs.bend, inputs.lines)
+    parameters, residual, jacobian = fit.parameters, fit.residual, fit.jacobian
     weighted = jacobian * window.weight[:, None]
     normal = (weighted @ jacobian.mT).double() + torch.diag_embed(prior.diagonal())
     inverse, _ = torch.linalg.inv_ex(normal)
     images = usable.shape
-    residual = levels - window.levels
     freedom = (window.weight.sum(-1) - PARAMETERS).clamp_min(1.0)
     noise = (window.weight * residual.square()).sum(-1) / freedom
     covariance = center_covariance(

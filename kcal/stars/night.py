@@ -206,6 +206,7 @@ _LENS_PX = 2.5
 _DAY = 0.5
 # Degrees of roll beyond which a camera rather has a wrong place or time than that it lies on its side.
 _ON_ITS_SIDE = 45.0
+_TWILIGHT = -4.0  # degrees: with the Sun higher, cameras see no stars but the brightest
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -398,14 +399,23 @@ def _on_earth(among: NamedStars, catalog: night_sky.StarCatalog, camera: Camera)
     used = on_ground.star[on_ground.star >= 0]
     covariance = on_ground.covariance + _by_clock(view) + _by_air(view, catalog, used)
     _, _, roll = attitude(on_ground.rotation.T)
+    assert view.time is not None
+    assert view.origin is not None
+    sun = night_sky.sun_altitude(view.time, view.origin)
+    day = f"the Sun would stand at {sun:+.0f}° there and then: place or time is wrong"
     rolled = f"the camera would be rolled by {roll:.0f}°: unless it lies on its side, place or time is wrong"
     part = _part(catalog, used)
     vacuum = view.directions(part, night_sky.Air(hectopascal=0.0))
     sigma = blurred[on_ground.star >= 0]
     doubt = refraction_doubt(on_ground, sigma, torch.from_numpy(there[used]), torch.from_numpy(vacuum), camera)
-    told = tuple(filter(None, (rolled if abs(roll) > _ON_ITS_SIDE else None, doubt)))
+    told = (day if sun > _TWILIGHT else None, rolled if abs(roll) > _ON_ITS_SIDE else None, doubt)
     return dataclasses.replace(
-        among, attitude=on_ground, directions=there, on_earth=True, covariance=covariance, warnings=told
+        among,
+        attitude=on_ground,
+        directions=there,
+        on_earth=True,
+        covariance=covariance,
+        warnings=tuple(filter(None, told)),
     )
 
 

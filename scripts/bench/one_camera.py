@@ -94,8 +94,8 @@ def epipolar(rig: Rig, left: Tensor, right: Tensor) -> Tensor:
 def rig_of(model: str, sides: list[Observations]) -> Rig:
     """Both cameras and the rig by default, from the same pairs: lenses, board and pose are refined together."""
     name, _, prior = model.partition(", ")
-    options = CalibrationOptions(model=name, weak_prior=0.3 if prior else None)
-    cameras = [calibrate_camera(seen, options if name != "hybrid" else None).camera for seen in sides]
+    options = CalibrationOptions(model=name, weak_prior=0.3 if prior else None) if name != "hybrid" else None
+    cameras = [calibrate_camera(seen, options).camera for seen in sides]
     pairs = list(zip(sides[0].names, sides[1].names, strict=True))
     return calibrate_rig(cameras[0], cameras[1], sides[0], sides[1], pairs, RigOptions(reject=False)).stereo()
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcal.corners.board import Board
 from kcal.corners.circles import _goes_on, _symmetric, wrong_size
-from kcal.corners.erf import _bounded, _odd, _pixel_pairs
+from kcal.corners.erf import _bounded, _odd
 from kcal.corners.erf_board import (
     RAMP_WEIGHT,
     UNKNOWN_RAMP,
@@ -302,13 +302,6 @@ class TestSpread:
         _, pair = _odd(odd, lopsided, torch.zeros(1, 1, 2).double())
         assert pair[0, 0, 2].tolist() == [0.3, 1, 1, 1, 0.3]
 
-    @pytest.mark.parametrize(("down", "right"), [(0, 1), (1, 0), (2, -1), (1, 2)])
-    def test_pairs_of_pixels(self, down: int, right: int) -> None:
-        number = torch.arange(30).reshape(5, 6)
-        here, there = _pixel_pairs(down, right)
-        assert (number[there] - number[here]).unique().tolist() == [6 * down + right]
-        assert number[here].shape == (5 - down, 6 - abs(right))
-
     def test_windows(self) -> None:
         places = torch.arange(49)
         window = CornerWindow(
@@ -320,6 +313,11 @@ class TestSpread:
         assert weight[3].tolist() == pytest.approx([0.0, 0.25, 1.0, 1.0, 1.0, 0.75, 0.0])
         assert float(weight[1, 3]) == pytest.approx(2.5 - math.hypot(2, 0.25))
         assert window.of(torch.tensor([0])).radius.tolist() == [2.0]
+        coarse = window.coarse()
+        # Each row and each column of five has one pixel.
+        assert coarse.where.long().tolist() == [
+            [1, -3], [-1, -2], [-3, -1], [2, -1], [0, 0], [-2, 1], [3, 1], [1, 2], [-1, 3]
+        ]  # fmt: skip
 
 
 class TestFrames:

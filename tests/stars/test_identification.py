@@ -141,6 +141,11 @@ def test_wrong_time_is_stated(night: Any) -> None:
     assert found.attitude.count > 30
     assert not found.on_earth
     assert "would stand below the horizon" in found.warnings[0]
+    # Half a year and half a day later the same stars stand there by day.
+    by_day = name_stars(night, CAMERA, SkyView(time=TIME + datetime.timedelta(days=182.5), origin=PLACE))
+    assert by_day.on_earth
+    assert "the Sun would stand at +" in by_day.warnings[0]
+    assert name_stars(night, CAMERA, SkyView(time=TIME, origin=PLACE)).warnings == ()
 
 
 @pytest.mark.parametrize(
