@@ -257,6 +257,7 @@ def calibrate_command(
     usable = True
     in_full = verbose or not options.hybrid
     figures: dict[str, dict[str, Any]] = {}
+    noise = None
     for i, (place, result) in enumerate(zip(places, outcomes, strict=True)):
         if len(places) > 1:
             print_styled(place.name, ".*")
@@ -275,7 +276,7 @@ def calibrate_command(
             out.print(f"the board is that of {others} (evidence {result.shared_board.evidence:.0f} nats)")
         print_wrote(place.output, place.picture)
         if needs or place.report is not None:
-            noise = pixel_sigma_of(pixel_sigma)
+            noise = noise or pixel_sigma_of(pixel_sigma)
             found = judged(result, options, needs, baseline=baseline, mark_sigma=noise, name=place.name)
             figures[place.name]["verdict"] = found.verdict.to_dict()
             usable = told_usable(found, place.report, result.findings) and usable

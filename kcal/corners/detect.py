@@ -290,6 +290,7 @@ def recognize_board(
 
 # Find a board in one image, or in all images of a camera.
 
+_SMALLEST = 16  # pixels on a side; smaller images hold no board, and OpenCV's detectors fail on them
 MIN_GOOD = 0.5  # share of the corners that must be refined successfully
 
 
@@ -338,6 +339,8 @@ def detect_board(image: Gray | Tensor, board: Board, refine: Refinement = "erf")
         )
     if refine not in get_args(Refinement):
         raise InputError(f"refine {refine!r}: choose one of {', '.join(get_args(Refinement))}")
+    if tiny := _too_small(image):
+        return Detection(None, tiny)
     try:
         if board.markers:
             return detect_marked(image, board, refine)
@@ -521,11 +524,21 @@ def _files_and_images(paths: Any) -> list[Any]:
 
 
 def image_and_hash(source: Any) -> tuple[Any, str | None]:
-    """An image, and the hash of its file's bytes if it comes from one."""
-    if not isinstance(source, Path):
-        return as_image(source), None
-    data = image_bytes(source)
-    return decode_gray(data, source), hashlib.sha256(data).hexdigest()
+    """An image, and the hash of its file's bytes if it comes from one.
+
+    Raises:
+        FileError: the file cannot be read, or the image is too small to be searched.
+    """
+    data = image_bytes(source) if isinstance(source, Path) else None
+    image = as_image(source) if data is None else decode_gray(data, source)
+    if tiny := _too_small(image):
+        raise FileError(tiny)
+    return image, None if data is None else hashlib.sha256(data).hexdigest()
+
+
+def _too_small(image: Gray) -> str:
+    height, width = image.shape
+    return f"the image has only {width}x{height} pixels" if min(width, height) < _SMALLEST else ""
 
 
 def _renumbered(

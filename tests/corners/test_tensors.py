@@ -17,7 +17,7 @@ from torch import Tensor
 from kcal import Board, CalibrationOptions, Camera, InputError
 from kcal.calibrate import CalibrationLayer
 from kcal.corners import CornerStatus, refine_point
-from kcal.corners.detect import as_image, detect_board
+from kcal.corners.detect import as_image, detect, detect_board, recognize_board
 from kcal.corners.grid import local_side
 from kcal.corners.refine import RefineCorners, refine_corners
 from kcal.lens import rotation_from_vector
@@ -317,3 +317,14 @@ def test_the_blur_of_corners(blur: float) -> None:
     assert found.status.tolist() == [int(CornerStatus.MISSING)] + [int(CornerStatus.GOOD)] * 19
     assert bool(found.blur[0].isnan() & found.pixels[0].isnan().all() & found.covariance[0].isnan().all())
     assert found.blur[1:].tolist() == pytest.approx([(blur**2 + 1.0 / 12.0) ** 0.5] * 19, rel=0.1)
+
+
+@pytest.mark.parametrize("pattern", ["checkerboard", "circles"])
+@pytest.mark.parametrize("side", [0, 1, 15])
+def test_images_without_room_for_a_board(side: int, pattern: Literal["checkerboard", "circles"]) -> None:
+    image, board = np.zeros((side, side), np.uint8), Board(columns=5, rows=4, square=0.02, pattern=pattern)
+    assert detect_board(image, board).reason == f"the image has only {side}x{side} pixels"
+    with pytest.raises(InputError, match=f"image 0: the image has only {side}x{side} pixels"):
+        detect([image] * 3, board)
+    with pytest.raises(InputError, match="give --board"):
+        recognize_board(image, "25mm")

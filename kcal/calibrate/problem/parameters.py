@@ -344,7 +344,13 @@ class ParameterConstraints:
         twice = {name for name in tied if tied.count(name) > 1}
         if twice:
             raise InputError(f"parameter {min(twice)} is tied twice: write one tie with all parameters that are equal")
-        for name, (mean, sigma) in self.priors.items():
+        for name, prior in self.priors.items():
+            try:
+                mean, sigma = map(float, prior)
+            except (TypeError, ValueError) as error:
+                raise InputError(
+                    f"prior of {name} is {prior!r}; a pair (mean, standard deviation) is needed"
+                ) from error
             if not (math.isfinite(mean) and math.isfinite(sigma) and sigma > 0):
                 raise InputError(f"prior of {name} is {mean} ± {sigma}; it needs a positive standard deviation")
 

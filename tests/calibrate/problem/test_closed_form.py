@@ -323,6 +323,8 @@ def test_a_wide_field_of_view_begins_equidistant(model: str) -> None:
         ({"fixed": {"skew": 3.0}, "free": ("skew",)}, "skew is fixed and freed"),
         ({"priors": {"skew": (3.0, 1.0)}}, "skew is held at 0"),
         ({"priors": {"fx": (3.0, 0.0)}}, "positive standard deviation"),
+        ({"priors": {"fx": 800}}, "prior of fx is 800; a pair"),
+        ({"priors": {"fx": (800, 1, 2)}}, "a pair"),
         ({"tied": (("fx",),)}, "two parameters"),
         ({"tied": (("fx", "fy"), ("fy", "cx"))}, "fy is tied twice"),
         ({"field_of_view": 180.0}, "opencv5 has less than 180; use the hybrid lens"),
