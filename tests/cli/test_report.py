@@ -76,7 +76,9 @@ def test_calibration_ends_with_3_where_what_is_required_is_not_met(folder: Path)
     assert code == 1
     (folder / "right.obs.json").write_bytes((folder / "left.obs.json").read_bytes())
     both = [str(folder / f"{side}.obs.json") for side in ("left", "right")]
-    found = CliRunner().invoke(app, ["calibrate", *both, "-o", str(folder / "both"), *words[4:], "--require", "200m:5%"])
+    found = CliRunner().invoke(
+        app, ["calibrate", *both, "-o", str(folder / "both"), *words[4:], "--require", "200m:5%"]
+    )
     assert found.stdout.count("NO: the lens model pinhole") == 2
     assert found.stderr.count("noise of marks: 0.3 px, assumed") == 1
 
