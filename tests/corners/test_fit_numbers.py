@@ -13,7 +13,15 @@ from torch import Tensor
 
 from kcal.corners.circles import Ellipses, _pixels, _system, _with_statuses, fit_ellipses
 from kcal.corners.erf import _start, center_covariance, fit_crossings
-from kcal.corners.erf_board import CornerWindow, LineDistances, crossing, cut_windows, light_at, line_covariance
+from kcal.corners.erf_board import (
+    CornerWindow,
+    LineDistances,
+    RampPrior,
+    crossing,
+    cut_windows,
+    light_at,
+    line_covariance,
+)
 from kcal.corners.grid import Neighbors
 from kcal.corners.patches import (
     RIVAL_DISTANCE,
@@ -195,7 +203,7 @@ class TestCorners:
         (4.0, 0.3, 2.5, False), (16.0, 0.8, 8.0, False), (30.0, 0.8, 12.0, False), (12.0, 2.2, 9.0, True),
     ])  # fmt: skip
     def test_windows_of_half_a_square_and_wider_where_lines_are_near(
-        self, side: float, blur: float, radius: float, near: bool
+        self, side: float, blur: float, radius: float, near: bool, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         x = torch.arange(61.0, dtype=torch.float64)
 
@@ -213,6 +221,14 @@ class TestCorners:
         assert fit.near.tolist() == [near]
         assert fit.center[0].tolist() == pytest.approx([-0.3, 0.2], abs=0.02)
         assert float(fit.blur) == pytest.approx(blur, rel=0.03)
+        # How much the board's light counts for a corner follows from the noise of gray levels.
+        noise: list[float] = []
+        prior = RampPrior.of
+        monkeypatch.setattr(RampPrior, "of", lambda p, m, e, v: (noise.append(float(v)), prior(p, m, e, v))[1])
+        fit_crossings(image[None] + 3.0 * draw(1, 61, 61), start, sides, None, around, 0.0)
+        assert noise[0] == 0.0
+        assert len(noise) == 2 + near
+        assert noise[1:] == pytest.approx([9.0] * (1 + near), rel=0.3)
         # A marker in the square leaves less than half of it.
         narrow = fit_crossings(image[None], start, 0.9 * sides, None, around, 0.0)
         assert float(narrow.window.radius) == pytest.approx(min(max(0.45 * side, 2.5), 12.0))
