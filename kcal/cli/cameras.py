@@ -111,7 +111,7 @@ def import_command(
     """Read a camera or a rig from a file of another program.
 
     The format is recognized. Cameras with their relative poses become a rig file. With --board, corners become an
-    observations file: mrcal's corners.vnl, CSV (image,u,v,weight), image_points of OpenCV's sample, and MATLAB's
+    observations file: mrcal's corners.vnl, CSV (image,u,v,weight), image_points of OpenCV's samples, and MATLAB's
     imagePoints. GeoJSON and GPX become a survey.csv for `kcal rig --landmarks`.
 
     **Examples**

@@ -168,6 +168,12 @@ TAGS = "apriltag_36h11"  # the dictionary of an AprilGrid
 _TARGET_FILES = (".yaml", ".yml")
 
 
+def square_of(text: str) -> str:
+    """What `--square` is of a board with this text."""
+    lengths = {"circles": "the distance of its circles", "asymmetric": "the distance of its rows of circles"}
+    return {"aprilgrid": "the side of its tags", **lengths}.get(text.partition(":")[0], "the side of its squares")
+
+
 class Board(Record):
     """A checkerboard, a grid of circles or an AprilGrid, described by its points in rows and columns.
 
@@ -273,7 +279,7 @@ class Board(Record):
             fields = target_fields(size)
         else:
             if not square:
-                raise InputError(f"board {size!r}: give the side of its squares as well, for example --square 25mm")
+                raise InputError(f"board {size!r}: give {square_of(size)} as well, for example --square 25mm")
             fields = board_fields(size, square)
         try:
             return cls(**fields)

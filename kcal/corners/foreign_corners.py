@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] |
 
     * `.vnl`: mrcal's corners, `filename x y level` or `filename x y weight`; a level is a weight of 2^-level.
     * `.csv`: `image,u,v` and, if need be, `weight` and the corner as `corner` or as `column,row`, from 0.
-    * `.yml`, `.yaml`, `.xml`: `image_points` of OpenCV's calibration sample.
+    * `.yml`, `.yaml`, `.xml`: `image_points` of OpenCV's calibration sample, `imagePoints` of its omnidir.
     * `.mat`: MATLAB's `imagePoints` with `worldPoints`, or in the order of its detector, down the columns first.
 
     Pixels are converted to kcal's convention: (0, 0) is the center of the first pixel.
@@ -172,11 +172,13 @@ def _place(column: int, row: int, board: Board, where: str) -> int:
 
 def _from_opencv(path: Path, board: Board) -> tuple[dict[str, list[Corner]], tuple[int, int] | None]:
     stored = read_storage(read_bytes(path, MOST_BYTES), str(path))
-    points = stored.get("image_points")
-    if not isinstance(points, np.ndarray) or points.ndim != 3 or points.shape[2] != 2:
-        raise ValueError("image_points of OpenCV's calibration sample, views by corners, are needed")
-    sides = [stored.get(name) for name in ("image_width", "image_height")]
-    return _unweighted(points), None if None in sides else _whole_size(sides)
+    # A matrix of views by corners, or a matrix of each view, as cv::omnidir's data have them.
+    points = stored.get("image_points", stored.get("imagePoints"))
+    if not isinstance(points, list | np.ndarray):
+        raise ValueError("image_points of OpenCV's calibration sample, or imagePoints of its omnidir, are needed")
+    size = stored.get("imageSize", [stored.get(name) for name in ("image_width", "image_height")])
+    views = [np.asarray(view, dtype=float).reshape(-1, 2) for view in points]
+    return _unweighted(views), None if None in size else _whole_size(size)
 
 
 def _whole_size(sides: Any) -> tuple[int, int]:
@@ -187,7 +189,7 @@ def _whole_size(sides: Any) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _unweighted(points: np.ndarray) -> dict[str, list[Corner]]:
+def _unweighted(points: Iterable[np.ndarray]) -> dict[str, list[Corner]]:
     """Views named by their numbers; NaN where a corner was not seen."""
     return {
         f"{number:03d}": [(float(u), float(v), 1.0) if np.isfinite(u + v) else _UNSEEN for u, v in view]

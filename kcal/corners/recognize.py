@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from kcal.corners.board import DICTIONARIES, TAGS, Board
+from kcal.corners.board import DICTIONARIES, TAGS, Board, square_of
 from kcal.corners.circles import round_blobs
 from kcal.corners.grid import goes_on, sound_grid
 from kcal.corners.marker_boards import BORDERS, nearer
@@ -35,6 +35,7 @@ _MOST_ACROSS = 40  # squares or tags in a row
 _TOLERANCE = 0.35  # of a square: distance of a marker's center from where the others put it
 _SAME_SHARE = 0.03  # of a marker's side, or of a tag's: sizes nearer than this to an ordinary one are that
 _PLACED = 0.6  # of the markers seen: share that must lie as on one board
+_AMISS = 0.3  # of a marker's side: how far its edges may differ from those of a square along the board's axes
 _DRAWS = 100  # of four markers: with so many, all draws contain a wrong one once in a million times
 _CELL = 4  # pixels of a marker's cell, where it is compared with a dictionary
 _CORRECTED = 0.6  # of the cells that a dictionary could correct: OpenCV's share
@@ -194,7 +195,9 @@ def marker_board(picture: npt.NDArray[np.uint8], seen: SeenMarkers) -> SeenBoard
             if good.sum() <= most or min(np.ptp(places[good], axis=0)) < 1:
                 continue
             tags = np.stack([_at_squares(picture, one) for one in image[good]]) if kind == "aprilgrid" else image[good]
-            side = _sides(np.asarray(found, np.float64), tags)
+            # Most markers of ArUco's grid boards fit as well, but sheared, stretched or too large.
+            if not 0 < (side := _sides(np.asarray(found, np.float64), tags)) < 1:
+                continue
             rows = np.abs(places[good][:, 1])
             low, high = int(rows.min()), int(rows.max()) + 1
             most = int(good.sum())
@@ -220,9 +223,12 @@ def _at_squares(picture: npt.NDArray[np.uint8], tag: npt.NDArray[np.float64]) ->
 
 
 def _sides(board_from_image: npt.NDArray[np.float64], image: npt.NDArray[np.float64]) -> float:
-    """The median side of markers (M, 4, 2), in units of the board."""
+    """The median side of markers (M, 4, 2), in units of the board; 0 where most are no squares along its axes."""
     there = cv2.perspectiveTransform(image.reshape(1, -1, 2), board_from_image).reshape(-1, 4, 2)
-    return float(np.median(np.linalg.norm(there - np.roll(there, 1, 1), axis=-1)))
+    edges = there - np.roll(there, 1, 1)
+    side = float(np.median(np.linalg.norm(edges, axis=-1)))
+    amiss = np.abs(np.sort(np.abs(edges)) - (0.0, side)).max((1, 2))
+    return side if np.median(amiss) < _AMISS * side else 0.0
 
 
 # Circles: how many there are each way.
@@ -388,7 +394,8 @@ class Recognized(NamedTuple):
         if square is None:
             raise InputError(
                 f"the board is {self.seen.text}, seen in {self.votes} of {self.looked} images that were looked at. "
-                "Images do not tell its size: measure the side of a square, and give it, for example --square 25mm"
+                f"Images do not tell its size: measure {square_of(self.seen.text)}, "
+                "and give it, for example --square 25mm"
             )
         return self.seen.board(square)
 

@@ -236,7 +236,8 @@ def read_keyed(content: Mapping[str, Any], name: str, hints: foreign.Hints, titl
     poses = _poses(named, list(parts.values()), hints, notes)
     if not parts and not poses:
         named.keys.rest()
-        raise ValueError("no camera: a matrix (camera_matrix, K, M1, ...), or fx, fy, cx and cy, is needed")
+        needed = "a matrix (camera_matrix, K, M1, ...), or fx, fy, cx and cy, is needed"
+        raise ValueError(f"no camera: {needed}; corners are read with --board")
     if cameras and len(poses) == len(parts):
         poses = tuple(pose for pose, label in zip(poses, parts, strict=True) if label not in refused)
     for whole in {id(part): part for part, _ in [*parts.values(), (named, "")]}.values():

@@ -17,7 +17,15 @@ from kcal import Board, Camera, InputError, Observations, detect
 from kcal.calibrate.camera.calibrate import calibrate_camera
 from kcal.corners import detect_board, recognize_board
 from kcal.corners.images import decode_gray, decode_image, exif_orientation, expand_images, image_header
-from kcal.corners.recognize import Recognized, circle_board, marker_board, most_markers, seen_board, spread_order
+from kcal.corners.recognize import (
+    Recognized,
+    SeenMarkers,
+    circle_board,
+    marker_board,
+    most_markers,
+    seen_board,
+    spread_order,
+)
 from kcal.io.images import write_png
 from scripts.shared.printed_board import Paper, pose
 
@@ -96,6 +104,11 @@ def test_markers_and_spots_that_are_no_board() -> None:
     assert marker_board(image, seen) is not None
     shuffled = dict(zip(seen.corners, random.permutation(list(seen.corners.values())), strict=True))
     assert marker_board(image, seen._replace(corners=shuffled)) is None
+    # ArUco's grid boards: most of their markers lie as some ChArUco board has them, but sheared or too large.
+    for across, count in ((3, 15), (4, 16)):
+        places = 100.0 * np.stack([np.arange(count) % across, np.arange(count) // across], 1)
+        corners = places[:, None] + [(0, 0), (80, 0), (80, 80), (0, 80)]
+        assert marker_board(image, SeenMarkers("6x6_50", 1, dict(enumerate(corners)))) is None
     assert circle_board([tuple(place) for place in random.uniform(0, 500, (40, 2)).tolist()]) is None
     grid = [(30.0 * i, 30.0 * j) for i in range(6) for j in range(5)]
     assert circle_board(grid) is not None

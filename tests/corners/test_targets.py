@@ -20,6 +20,7 @@ from kcal.corners.detect import Detection, view_of
 from kcal.corners.foreign_corners import import_corners
 from kcal.corners.markers import opencv_dictionary
 from kcal.corners.print_board import Circle, Drawing, board_sheet, pattern_shapes, tag_cells, to_pdf, to_svg
+from kcal.io.formats import import_cameras
 from kcal.lens.calibration import BoardRecord
 
 # What boards are: texts, target files of Kalibr, where their points lie, and what files keep of them.
@@ -55,6 +56,7 @@ def test_texts():
         ("charuco:9x6:id20", "25mm", "35 markers from number 20 on, dictionary 4x4_50 fewer"),
         ("9x6:id3", "25mm", "is no kind of board"),
         ("9x6", None, "give the side of its squares as well"),
+        ("asymmetric:4x11", None, "give the distance of its rows of circles as well"),
     ],
 )
 def test_refused_texts(text, square, message):
@@ -303,6 +305,15 @@ def test_opencv(tmp_path: Path) -> None:
     assert (seen.image_size, seen.names) == (SIZE, ("001", "002"))
     assert seen.views[1].pixels[5] == (22.0, 23.0)
     assert seen.views[1].covariance is None
+    # The data of cv::omnidir's samples: a matrix of each view.
+    view = "<_ type_id='opencv-matrix'><rows>6</rows><cols>1</cols><dt>'2f'</dt><data>{}</data></_>"
+    views = "".join(view.format(" ".join(map(str, range(first, first + 12)))) for first in (0, 12))
+    stored = f"<imagePoints>{views}</imagePoints><imageSize>640 480</imageSize>"
+    path = tmp_path / "omni.xml"
+    path.write_text(f'<?xml version="1.0"?><opencv_storage>{stored}</opencv_storage>')
+    assert import_corners(path, BOARD) == seen
+    with pytest.raises(FileError, match="corners are read with --board"):
+        import_cameras(path)
 
 
 @pytest.mark.parametrize("world", [True, False])
