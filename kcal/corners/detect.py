@@ -583,9 +583,8 @@ def view_of(found: Detection, name: str, image: str | None = None, sha256: str |
     """
     if found.pixels is None:
         raise InputError(f"{name}: {found.reason}")
-    corners: dict[str, Any] = {"pixels": found.pixels}
-    if found.covariance is not None:
-        corners["covariance"] = found.covariance.reshape(-1, 4)[:, [0, 1, 3]]
+    spread = None if found.covariance is None else found.covariance.reshape(-1, 4)[:, [0, 1, 3]]
+    corners: dict[str, Any] = {"pixels": found.pixels, "covariance": spread}
     return View(name=name, image=image, sha256=sha256, **corners)
 
 

@@ -161,7 +161,6 @@ MIN_RADIUS = 2.5  # pixels: fewer would not determine ten parameters
 # The next line is left out where it is more sigmas of blur from the window's rim: 3e-4 of the contrast.
 REACH = 3.5
 _FIRST_STEPS, _STEPS = 4, 20
-_PIXELS = 1 << 15  # in the windows of the corners that are fitted together
 _COARSE_RADIUS = 8.0  # pixels: from here on every fourth pixel is enough for the first steps
 _CONVERGED = 1e-5  # pixels: the next step would be shorter; in float64 a tenth of it
 _FLOOR = 1e-7  # of the scaled normal matrix: what float32 leaves of it
@@ -206,7 +205,8 @@ class _FitInputs(NamedTuple):
 
     def of(self, some: Tensor) -> _FitInputs:
         lines = None if self.lines is None else LineDistances(*(value[some] for value in self.lines))
-        return _FitInputs(self.window.of(some), self.bend[some], self.prior.of_some(some), lines)
+        prior = RampPrior(*(value[some] for value in self.prior))
+        return _FitInputs(self.window.of(some), self.bend[some], prior, lines)
 
 
 def fit_crossings(
@@ -233,8 +233,7 @@ def fit_crossings(
     curves = curvatures(bend, first) if bend is not None else nothing
     prior = RampPrior.of(first, nothing, nothing[:, 0], nothing[:, 0])
     # A few steps are enough to estimate the illumination of the board and which lines reach into windows.
-    inputs = _FitInputs(coarse, curves, prior, None)
-    fit = _fitted(first, inputs, torch.arange(len(first), device=first.device), _FIRST_STEPS)
+    fit = _levenberg_marquardt(first, _FitInputs(coarse, curves, prior, None), _FIRST_STEPS)
     usable = crosses & torch.isfinite(fit.cost)
     lines = None
     near = torch.zeros_like(crosses)
@@ -252,9 +251,8 @@ def fit_crossings(
     inputs = _FitInputs(window, curves, prior, lines)
     # With lines each step is twice the work, so only corners near one get them. These are fitted twice, because only
     # the first of the two fits makes the illumination well determined.
-    whole = window.levels.new_zeros(len(first), PARAMETERS, window.levels.shape[-1])
-    variance = fit.cost / coarse.weight.sum(-1)
-    fit = fit._replace(residual=torch.zeros_like(window.levels), jacobian=whole)
+    variance, residual = fit.cost / coarse.weight.sum(-1), torch.zeros_like(window.levels)
+    fit = fit._replace(residual=residual, jacobian=residual[:, None].repeat(1, PARAMETERS, 1))
     for group, with_lines in ((~near, False), (near, True), (near, True)):
         some = group.nonzero()[:, 0]
         if not len(some):
@@ -263,7 +261,8 @@ def fit_crossings(
         place = base + fit.parameters[:, :2].reshape(base.shape)
         slope, error = light_slope(light, place, side, usable.reshape(side.shape))
         inputs = inputs._replace(prior=RampPrior.of(fit.parameters, slope, error, variance))
-        done = _fitted(fit.parameters, inputs if with_lines else inputs._replace(lines=None), some, _STEPS)
+        chosen = (inputs if with_lines else inputs._replace(lines=None)).of(some)
+        done = _levenberg_marquardt(fit.parameters[some], chosen, _STEPS)
         fit = _Fit(*(value.index_copy(0, some, new) for value, new in zip(fit, done, strict=True)))
         variance = fit.cost / window.weight.sum(-1)
     parameters = fit.parameters
@@ -291,13 +290,6 @@ class _Fit(NamedTuple):
 
     def of(self, some: Tensor) -> _Fit:
         return _Fit(*(value[some] for value in self))
-
-
-def _fitted(parameters: Tensor, inputs: _FitInputs, some: Tensor, steps: int) -> _Fit:
-    """Fit some of the corners, a few at a time: what they take stays in a core's cache."""
-    parts = some.split(max(1, _PIXELS // inputs.window.levels.shape[-1]))
-    done = [_levenberg_marquardt(parameters[part], inputs.of(part), steps) for part in parts]
-    return _Fit(*(torch.cat(values) for values in zip(*done, strict=True))) if len(done) > 1 else done[0]
 
 
 def _levenberg_marquardt(parameters: Tensor, inputs: _FitInputs, steps: int) -> _Fit:

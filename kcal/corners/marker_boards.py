@@ -77,7 +77,7 @@ def in_place(
         away[tried] = np.inf
         other = int(np.argmin(away.min(1)))
         near = np.flatnonzero(good)[np.argsort(away[other])[:_NEIGHBORS]]
-        found = board_homography(placed[near].reshape(-1, 2), seen[near].reshape(-1, 2))
+        found = board_homography(placed[near], seen[near])
         good[other] = found is not None and _misses(found, placed[[other]], seen[[other]])[0] < tolerance
         tried[other] = True
     return good
@@ -86,8 +86,9 @@ def in_place(
 def board_homography(
     placed: npt.NDArray[np.floating], seen: npt.NDArray[np.floating]
 ) -> npt.NDArray[np.float64] | None:
-    """(3, 3) board from image by least squares of points (N, 2); None where they determine none."""
-    found, _ = cv2.findHomography(seen.astype(np.float64), placed.astype(np.float64))
+    """(3, 3) board from image by least squares of points (..., 2); None where they determine none."""
+    image, board = (points.reshape(-1, 2).astype(np.float64) for points in (seen, placed))
+    found, _ = cv2.findHomography(image, board)
     if found is None or not np.isfinite(found).all():
         return None
     return np.asarray(found, np.float64)
@@ -430,15 +431,13 @@ def _in_place(seen: Markers, places: Markers, tolerance: float) -> Markers:
         near = sorted(away, key=away.__getitem__)[:_NEIGHBORS]
         own, placed = places[number], np.stack([places[other] for other in near])
         around = np.stack([seen[other] for other in near])
-        board_from_image = board_homography(placed.reshape(-1, 2), around.reshape(-1, 2))
+        board_from_image = board_homography(placed, around)
         if board_from_image is None:
             continue
         if _misses(board_from_image, own[None], corners[None])[0] > tolerance:
             continue
         # OpenCV finds tags too small by up to 4 px at each corner; their neighbors correct that.
-        both = board_homography(
-            np.concatenate([placed, own[None]]).reshape(-1, 2), np.append(around, corners).reshape(-1, 2)
-        )
+        both = board_homography(np.concatenate([placed, own[None]]), np.concatenate([around, corners[None]]))
         kept[number] = corners if both is None else cv2.perspectiveTransform(own[None], np.linalg.inv(both))[0]
     return kept
 

@@ -27,11 +27,11 @@ def gaussian_kernel(sigma: float, reach: int) -> Tensor:
     return weights / weights.sum()
 
 
-def filtered(image: Tensor, across: Tensor, down: Tensor) -> Tensor:
-    """Correlate the rows of (H, W) with one kernel and its columns with another of equal odd length; edges repeat."""
-    reach = len(across) // 2
-    padded = torch.nn.functional.pad(image[None, None], (reach,) * 4, mode="replicate")
-    return correlated(padded, across, down)[0, 0]
+def filtered(images: Tensor, across: Tensor, down: Tensor) -> Tensor:
+    """Correlate rows of (..., H, W) with one kernel and columns with another of equal odd length; edges repeat."""
+    reach, (height, width) = len(across) // 2, images.shape[-2:]
+    padded = torch.nn.functional.pad(images.reshape(-1, 1, height, width), (reach,) * 4, mode="replicate")
+    return correlated(padded, across, down).reshape(images.shape)
 
 
 def correlated(images: Tensor, across: Tensor, down: Tensor, *, zeros: int = 0) -> Tensor:
@@ -317,10 +317,7 @@ def _residual(patches: _Patches, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]
 def _biweight(residual: Tensor, scale: Tensor, patches: _Patches) -> Tensor:
     """(N, K) weights by the mean square of residuals (N, K) nearby."""
     kernel = _NEARBY.to(residual)
-    squares = residual.square().reshape(patches.template.shape)[:, None]
-    reach = len(kernel) // 2
-    padded = torch.nn.functional.pad(squares, (reach,) * 4, mode="replicate")
-    mean = correlated(padded, kernel, kernel).reshape(residual.shape)
+    mean = filtered(residual.square().reshape(patches.template.shape), kernel, kernel).reshape(residual.shape)
     return (1.0 - mean / (_BIWEIGHT * scale[:, None]).square()).clamp_min(0.0).square()
 
 

@@ -195,7 +195,6 @@ def _of_one_image(
         return erf_saddle(light, begin, side, bend=bend, around=around, levels=levels)
 
     fit = fitted(found.pixels)
-    assert fit.blur is not None
     if _is_jagged(fit, settled[:, 0]):
         jagged, sharp = fit, light
         from kornia.filters import gaussian_blur2d  # kornia takes long to load
@@ -215,14 +214,13 @@ def _of_one_image(
         fit = fitted(torch.where((fit.status == saddles.CornerStatus.GOOD)[:, None], fit.pixels, found.pixels))
     assert fit.covariance is not None
     assert fit.blur is not None
-    nan = float("nan")
     status = torch.where(settled[:, 0] | (fit.status == saddles.CornerStatus.SATURATED), fit.status, found.status)
     good = status == saddles.CornerStatus.GOOD
     return saddles.Refined(
-        torch.where(good[:, None], fit.pixels, nan),
+        torch.where(good[:, None], fit.pixels, math.nan),
         status,
-        torch.where(good[:, None, None], fit.covariance, nan),
-        torch.where(good, fit.blur, nan),
+        torch.where(good[:, None, None], fit.covariance, math.nan),
+        torch.where(good, fit.blur, math.nan),
     )
 
 

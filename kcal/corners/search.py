@@ -316,21 +316,19 @@ def _placements(
     """All boards (rows, columns, 2) of which the grid can be a part, NaN outside it."""
     places: list[Tensor] = []
     inverted: list[Tensor] = []
-    top, bottom, left, right = ends
     for _ in range(4):
         high, wide = grid.shape[:2]
         lighter = grids.contrast(image, grid, *local_steps(grid)) * grids.checkered(grid)
         dark = bool(lighter.nanmedian() < 0)  # the square diagonally outside the grid's first corner
-        for row in range(board.rows - high + 1):
-            for column in range(board.columns - wide + 1):
-                fits = (not top or row == 0) and (not bottom or row + high == board.rows)
-                fits = fits and (not left or column == 0) and (not right or column + wide == board.columns)
-                if fits:
-                    whole = torch.full((board.rows, board.columns, 2), torch.nan, dtype=torch.float64)
-                    whole[row : row + high, column : column + wide] = grid
-                    (places if dark == ((row + column) % 2 == 0) else inverted).append(whole)
+        for row, column in itertools.product(range(board.rows - high + 1), range(board.columns - wide + 1)):
+            beyond = row, board.rows - high - row, column, board.columns - wide - column
+            if not any(lines and end for lines, end in zip(beyond, ends, strict=True)):
+                whole = torch.full((board.rows, board.columns, 2), torch.nan, dtype=torch.float64)
+                whole[row : row + high, column : column + wide] = grid
+                (places if dark == ((row + column) % 2 == 0) else inverted).append(whole)
         grid = grid.transpose(0, 1).flip(1)
-        top, bottom, left, right = left, right, bottom, top
+        top, bottom, left, right = ends
+        ends = left, right, bottom, top
     # A whole board that is printed white on black has the other colors.
     return places or (inverted if all(ends) else [])
 

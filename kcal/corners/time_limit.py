@@ -7,7 +7,7 @@ import multiprocessing
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
@@ -21,7 +21,7 @@ class TookTooLongError(KcalError):
     """A call exceeded its time limit, or its process died."""
 
 
-class Limited:
+class Limited(AbstractContextManager["Limited"]):
     """Make calls one after the other, each with a limit of the time that processors work on it.
 
     Other work on the machine does not count. The first calls run in a thread of this process, at no cost. A thread that
@@ -47,9 +47,6 @@ class Limited:
         self._processes = False
         self._process: multiprocessing.process.BaseProcess | None = None
         self._pipe: Connection | None = None
-
-    def __enter__(self) -> Limited:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -9,10 +9,11 @@ import configparser
 import dataclasses
 import math
 import re
+from collections import UserDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -299,25 +300,17 @@ def flat(value: Any) -> list[float] | None:
         return None
 
 
-class Keys(Mapping[str, Any]):
+class Keys(UserDict[str, Any]):
     """A mapping that knows which of its keys were read."""
 
     def __init__(self, content: Mapping[str, Any]) -> None:
-        self.content, self.read = content, set[str]()
+        # Not copied, nor checked: what is no mapping is refused where it is read.
+        self.data, self.read = cast(dict[str, Any], content), set[str]()
 
     def __getitem__(self, key: str) -> Any:
-        value = self.content[key]
+        value = self.data[key]
         self.read.add(key)
         return value
-
-    def __contains__(self, key: object) -> bool:
-        return key in self.content
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.content)
-
-    def __len__(self) -> int:
-        return len(self.content)
 
     def rest(self, where: str = "") -> list[str]:
         """A note on the keys that were not read.
@@ -329,8 +322,8 @@ class Keys(Mapping[str, Any]):
         return [f"not read: {', '.join(unknown[:_MOST_NAMED])}"] if unknown else []
 
     def _unread(self, where: str) -> Iterator[str]:
-        for key in (key for key in self.content if key not in self.read):
-            value, name = self.content[key], re.sub("^cam(?:era)?(?=[a-z])", "", bare(key))
+        for key in (key for key in self.data if key not in self.read):
+            value, name = self.data[key], re.sub("^cam(?:era)?(?=[a-z])", "", bare(key))
             name = (BEFORE.fullmatch(name) or ("", "", name))[2]
             found = whole = flat(value)
             if whole is None and isinstance(value, list):

@@ -184,27 +184,22 @@ def ros_values(
 ) -> Iterator[tuple[tuple[int, int], str, list[np.ndarray]]]:
     """Size, name of the lens model, and K, D (1, N), R and P of each camera; two with poses are rectified."""
     matrices = [np.array(plain(camera.matrix)) for camera in cameras]
+    rectified: list[tuple[np.ndarray, np.ndarray]]
     rectified = [(np.eye(3), np.pad(matrix, ((0, 0), (0, 1)))) for matrix in matrices]
     if len(cameras) == 2 and poses:
-        rectified = _rectify(ImportedCameras(format="ros", cameras=tuple(cameras), poses=tuple(poses)))
+        rig = ImportedCameras(format="ros", cameras=tuple(cameras), poses=tuple(poses)).rig()
+        rotation, translation = np.array(plain(rig.right_from_left_rotation)), plain(rig.right_from_left_translation)
+        none, shift = np.zeros(5), np.array(translation)[:, None]
+        # The lens only affects how much of the image is kept. Rows of the frame shared by both cameras; its x axis is
+        # the baseline, so nothing is left along y and z.
+        left, right, project_left, project_right = cv2.stereoRectify(
+            matrices[0], none, matrices[1], none, cameras[0].size, rotation, shift, alpha=0
+        )[:4]
+        rectified = [(left, project_left), (right, project_right)]
     for camera, matrix, turned in zip(cameras, matrices, rectified, strict=True):
         lens = _five(camera)
         kind = "equidistant" if camera.model.fisheye else "rational_polynomial" if len(lens) > 5 else "plumb_bob"
         yield camera.size, kind, [matrix, np.array([lens]), *turned]
-
-
-def _rectify(pair: ImportedCameras) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Rotation (3, 3) and projection (3, 4) of both cameras; the lens only affects how much of the image is kept."""
-    rig = pair.rig()
-    matrices = [np.array(plain(camera.matrix)) for camera in pair.cameras]
-    none = np.zeros(5)
-    rotation, translation = np.array(plain(rig.right_from_left_rotation)), plain(rig.right_from_left_translation)
-    found = cv2.stereoRectify(
-        matrices[0], none, matrices[1], none, pair.cameras[0].size, rotation, np.array(translation)[:, None], alpha=0
-    )
-    left, right, project_left, project_right = found[:4]
-    # Rows of the frame shared by both cameras; its x axis is the baseline, so nothing is left along y and z.
-    return [(left, project_left), (right, project_right)]
 
 
 # TOML files of aniposelib, pose2sim and Caliscope: a table per camera, in OpenCV's conventions.

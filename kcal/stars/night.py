@@ -400,8 +400,7 @@ def _on_earth(among: NamedStars, catalog: night_sky.StarCatalog, camera: Camera)
     covariance = on_ground.covariance + _by_clock(view) + _by_air(view, catalog, used)
     _, _, roll = attitude(on_ground.rotation.T)
     assert view.time is not None
-    assert view.origin is not None
-    sun = night_sky.sun_altitude(view.time, view.origin)
+    sun = math.degrees(math.asin(view.directions(night_sky.sun_at(view.time))[0, 2]))
     day = f"the Sun would stand at {sun:+.0f}° there and then: place or time is wrong"
     rolled = f"the camera would be rolled by {roll:.0f}°: unless it lies on its side, place or time is wrong"
     part = _part(catalog, used)

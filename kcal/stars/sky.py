@@ -288,24 +288,20 @@ def observed_directions(
     return unit_vectors(np.pi / 2 - azimuth, np.pi / 2 - zenith)
 
 
-def sun_altitude(time: datetime.datetime, origin: Origin) -> float:
-    """Degrees by which the Sun stands above the horizon; below, a degree or so is left to refraction.
-
-    Raises:
-        InputError: as in `observed_directions`.
+def sun_at(time: datetime.datetime) -> StarCatalog:
+    """The Sun at a time, as the only star of a catalog.
 
     Example:
-        >>> place = Origin(lat=52.0, lon=4.4, height=0.0)
-        >>> [round(sun_altitude(datetime.datetime(2019, 7, 29, hour, tzinfo=datetime.UTC), place)) for hour in (12, 21)]
-        [57, -10]
+        >>> place, time = Origin(lat=52.0, lon=4.4, height=0.0), datetime.datetime(2019, 7, 29, 21, tzinfo=datetime.UTC)
+        >>> round(float(np.degrees(np.arcsin(observed_directions(sun_at(time), time, place)[0, 2]))))
+        -10
     """
     erfa = require_erfa()
     with _quiet(erfa):
         earth, _ = erfa.epv00(*_julian(erfa, time))
     x, y, z = -np.asarray(earth["p"])[:, None]
     ra, dec, still = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), np.zeros(1)
-    sun = StarCatalog(number=np.zeros(1, np.int64), ra=ra, dec=dec, pm_ra=still, pm_dec=still, magnitude=still)
-    return math.degrees(math.asin(observed_directions(sun, time, origin)[0, 2]))
+    return StarCatalog(number=np.zeros(1, np.int64), ra=ra, dec=dec, pm_ra=still, pm_dec=still, magnitude=still)
 
 
 def pole_in_enu(lat: float) -> NDArray[np.float64]:

@@ -32,7 +32,6 @@ from kcal.calibrate.batch.jobs import (
     calibrate_again,
     calibrate_observations,
     calibrated,
-    calibration_options,
     detect_image,
     hash_of,
     observations_of,
@@ -40,7 +39,7 @@ from kcal.calibrate.batch.jobs import (
     sharing_jobs,
 )
 from kcal.calibrate.camera.calibrate import ALONE, sharing
-from kcal.calibrate.camera.result import HYBRID, CameraCalibrationResult
+from kcal.calibrate.camera.result import HYBRID, CalibrationOptions, CameraCalibrationResult
 from kcal.corners.detect import limit_threads
 from kcal.corners.images import image_bytes
 from kcal.corners.observations import Observations
@@ -192,7 +191,7 @@ class Results:
             self._keep(key, outcome)
         else:
             # Not kept: more memory or time may help.
-            why = _failure_text(outcome)
+            why = str(outcome) if isinstance(outcome, KcalError) else f"{type(outcome).__name__}: {outcome}"
             outcome = Detected(reason=why) if kind == "image" else Calibrated(error=why)
         if kind == "image":
             return self._detected(number, i, outcome)
@@ -245,7 +244,7 @@ class Results:
                 alone = self._each(calibrate_again, {i: (self._views[i], self.options) for i in good}, crew)
                 found = sharing(
                     [alone[i] for i in good],
-                    calibration_options(HYBRID, self.options),
+                    CalibrationOptions(model=HYBRID, board_warp=self.options.board_warp),
                     one_type=self.options.one_type,
                     run=lambda function, tasks: self._each(function, tasks, crew).items(),
                 )
@@ -304,11 +303,8 @@ class Results:
             focal=focal,
             sigma_focal=None if math.isnan(sigma_focal) else sigma_focal,
             rms=camera.calibration.rms,
-            fx=camera.intrinsics.fx,
-            fy=camera.intrinsics.fy,
-            cx=camera.intrinsics.cx,
-            cy=camera.intrinsics.cy,
             sigma_fx=(camera.standard_deviations or {}).get("fx"),
+            **camera.intrinsics.model_dump(exclude={"skew"}),
         )
 
     def _path(self, key: str) -> Path:
@@ -341,10 +337,6 @@ def _checksum(content: Any) -> str:
 def write_summary(path: Path, rows: list[SummaryRow]) -> Path:
     """Write the table as CSV, atomically."""
     return write_atomic(path, "".join(csv_line(row) for row in [SummaryRow._fields, *rows]))
-
-
-def _failure_text(error: Exception) -> str:
-    return str(error) if isinstance(error, KcalError) else f"{type(error).__name__}: {error}"
 
 
 # Run many pieces of work on many processes; each returns a result or a reason, even if its process dies.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -198,7 +198,11 @@ def calibrate_camera(
         wrong |= {i: wrong[first] for i, first in copied.items() if first in wrong}
         progress(f"again without {len(wrong)} views of another camera")
         return without_views(calibrate_camera(leaving_out(observations, wrong), options, progress), observations, wrong)
-    return _complete(checked, observations, copied)
+    names, views = observations.names, checked.observations.pixels()
+    more = (*copy_findings(names, copied), *pose_findings(views), *unit_findings(checked))
+    residuals = dict(zip((i for i in range(len(names)) if i not in copied), checked.per_view_rms.tolist(), strict=True))
+    without = {i: (f"{COPY} {names[first]}", residuals[first]) for i, first in copied.items()}
+    return among_all(dataclasses.replace(checked, findings=(*checked.findings, *more)), observations, without)
 
 
 def _check_spacing(observations: Observations, options: CalibrationOptions, progress: Progress) -> None:
@@ -214,17 +218,6 @@ def _check_spacing(observations: Observations, options: CalibrationOptions, prog
         return
     if found:
         raise InputError(found[0].sentence)
-
-
-def _complete(
-    result: CameraCalibrationResult, observations: Observations, copied: Mapping[int, int]
-) -> CameraCalibrationResult:
-    """A result without copies as one for all observations, with doubts about views that add nothing."""
-    names = observations.names
-    more = (*copy_findings(names, copied), *pose_findings(result.observations.pixels()), *unit_findings(result))
-    residuals = dict(zip((i for i in range(len(names)) if i not in copied), result.per_view_rms.tolist(), strict=True))
-    without = {i: (f"{COPY} {names[first]}", residuals[first]) for i, first in copied.items()}
-    return among_all(dataclasses.replace(result, findings=(*result.findings, *more)), observations, without)
 
 
 def _calibrate(observations: Observations, options: CalibrationOptions, progress: Progress) -> CameraCalibrationResult:

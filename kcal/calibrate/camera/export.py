@@ -465,13 +465,10 @@ def _write_maps(cameras: Sequence[Camera], path: Path) -> ExportedCameras:
     paths = paths_for(path, len(cameras))
     for camera, target in zip(cameras, paths, strict=True):
         new = new_pinhole(camera)
-        maps = undistort_maps(camera, new)
         data = io.BytesIO()
         np.savez(
             data,
-            map_x=maps.map_x,
-            map_y=maps.map_y,
-            mask=maps.mask,
+            **undistort_maps(camera, new)._asdict(),
             camera_matrix=np.array(plain(new.matrix)),
             image_size=np.array(camera.size),
             name=np.array(camera_name(camera, target.stem)),

@@ -314,15 +314,9 @@ class BoardFile(NativeFile):
 
     def measured(self) -> MeasuredBoard:
         """The board, equal to the stored one to the last bit."""
-        return MeasuredBoard(
-            name=self.name,
-            board=self.board,
-            amplitudes=torch.tensor(self.amplitudes, dtype=torch.float64),
-            half=torch.tensor(self.half, dtype=torch.float64),
-            log_evidence=self.log_evidence,
-            observations=self.observations,
-            corners=None if self.corners is None else torch.tensor(self.corners, dtype=torch.float64),
-        )
+        stored = {"amplitudes": self.amplitudes, "half": self.half, "corners": self.corners}
+        tensors = {n: None if own is None else torch.tensor(own, dtype=torch.float64) for n, own in stored.items()}
+        return MeasuredBoard(**dict(self) | tensors)
 
 
 def save_measured_board(board: MeasuredBoard, path: str | Path) -> Path:
@@ -342,15 +336,7 @@ def save_measured_board(board: MeasuredBoard, path: str | Path) -> Path:
         ...     bool((load_measured_board(path).points == plate.points).all())
         True
     """
-    return BoardFile(
-        name=board.name,
-        board=board.board,
-        amplitudes=tuple(board.amplitudes.tolist()),
-        half=tuple(map(tuple, board.half.tolist())),
-        log_evidence=board.log_evidence,
-        observations=board.observations,
-        corners=None if board.corners is None else tuple((x, y) for x, y in board.corners.tolist()),
-    ).save(path)
+    return BoardFile(**vars(board)).save(path)
 
 
 def load_measured_board(path: str | Path) -> MeasuredBoard:

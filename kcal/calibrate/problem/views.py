@@ -310,11 +310,7 @@ class Views:
     free_warp: bool = False
 
     def problem(
-        self,
-        model: LensModel,
-        free: Sequence[int] | FreeParameters = (),
-        *,
-        terms: Sequence[Term] = (),
+        self, model: LensModel, free: Sequence[int] | FreeParameters = (), *, terms: Sequence[Term] = ()
     ) -> BoardProblem:
         """The least-squares problem of these views; without free parameters, of the poses (and the warp) alone."""
         return BoardProblem(

@@ -81,7 +81,9 @@ class Adjustment:
             rotation=start.rotation,
             center=start.center,
             board=torch.zeros(len(unknowns.shapes), dtype=torch.float64),
-            items=all_of([source.begin(data.cameras, start) for source in data.seen], torch.zeros(0, OWN).double()),
+            items=torch.cat(
+                [torch.zeros(0, OWN).double(), *(source.begin(data.cameras, start) for source in data.seen)]
+            ),
         )
 
     def at(self, kind: str) -> slice:
@@ -133,7 +135,7 @@ class Adjustment:
     def at_survey(self, state: RigState) -> RigState:
         """A state of all items, with these where they are known to be beforehand."""
         parts = [source.as_given(state.items[at]) for source, at in self.sources]
-        return state._replace(items=all_of(parts, state.items[:0]))
+        return state._replace(items=torch.cat([state.items[:0], *parts]))
 
     def part(self, mask: Tensor) -> RigState:
         """The state of the cameras and of the items in the mask."""
@@ -163,21 +165,21 @@ class Adjustment:
     def _of_all(self, mask: Tensor, values: Sequence[Tensor]) -> Tensor:
         """Values of the items in the mask put among all: NaN for the others, infinite where one is not finite."""
         found = torch.full(mask.shape, math.nan, dtype=torch.float64)
-        found[mask] = all_of(values, found[:0]).nan_to_num(math.inf, math.inf)
+        found[mask] = torch.cat([found[:0], *values]).nan_to_num(math.inf, math.inf)
         return found
 
     def freedom(self, mask: Tensor) -> Tensor:
         """(V,) degrees of freedom of every item beyond its own unknowns; 0 outside the mask."""
         found = torch.zeros(mask.shape, dtype=torch.int64)
-        found[mask] = all_of([block.freedom for block in self.problem(mask).blocks], found[:0])
+        found[mask] = torch.cat([found[:0], *(block.freedom for block in self.problem(mask).blocks)])
         return found
 
     def squares_px(self, mask: Tensor, state: RigState) -> tuple[Tensor, Tensor]:
         """(V, C) squared distances of marks in a state of all items, px², and how many; zero outside the mask."""
         squared, count = (torch.zeros(len(mask), len(self.data.cameras), dtype=torch.float64) for _ in range(2))
         found = self.problem(mask).squares_px(state._replace(items=state.items[mask]))
-        squared[mask] = all_of([one for one, _ in found], squared[:0])
-        count[mask] = all_of([many for _, many in found], count[:0])
+        squared[mask] = torch.cat([squared[:0], *(one for one, _ in found)])
+        count[mask] = torch.cat([count[:0], *(many for _, many in found)])
         return squared, count
 
     def over_limit(self, mask: Tensor, value: Tensor, probability: float | None = None) -> Tensor:
@@ -264,11 +266,6 @@ class Adjustment:
         if 0 < ratio < math.inf:
             self.sigma_corner = max(self.sigma_corner * math.sqrt(ratio), _LEAST_SIGMA)
         return abs(self.sigma_corner / before - 1.0)
-
-
-def all_of(parts: Sequence[Tensor], none: Tensor) -> Tensor:
-    """Concatenate tensors; `none` is an empty tensor of their shape and type, for a list without any."""
-    return torch.cat([none, *parts])
 
 
 # Find what contradicts the rest of a joint adjustment: worst first, and back in what does not after all.

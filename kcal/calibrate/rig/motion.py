@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
@@ -187,12 +188,11 @@ class RigRows:
         self.parts = {part.camera: part for part in parts}
         finite = [part.rows.isfinite().all(-1).all(-1) for part in self.parts.values()]
         self.good, self.shared_size = torch.stack([good, *finite]).all(0), shared_size
-        self._whole: _Whole | None = None
 
     def put(self, camera: int, rows: Tensor) -> None:
         """Replace the rows of a camera."""
         self.parts[camera] = self.parts[camera]._replace(rows=rows)
-        self._whole = None
+        self.__dict__.pop("whole", None)
 
     def without(self, board: int) -> RigRows:
         """These rows, with one board no longer among the good ones."""
@@ -203,16 +203,15 @@ class RigRows:
     @property
     def variance(self) -> float:
         """Mean square of the residuals, in standard deviations, as boards that stand still leave them."""
-        return self._all().variance
+        return self.whole.variance
 
-    def _all(self) -> _Whole:
+    @functools.cached_property
+    def whole(self) -> _Whole:
         """All cameras together; formed once, as long as their rows are the same."""
-        if self._whole is None:
-            some = [part._replace(rows=part.rows[self.good]) for part in self.parts.values()]
-            residuals = sum(int((part.rows[:, :_POSE] != 0).any(1).sum()) for part in some)
-            count = residuals - _POSE * int(self.good.sum())
-            self._whole = _Whole.of(summed_products(some, _POSE, self.shared_size), count)
-        return self._whole
+        some = [part._replace(rows=part.rows[self.good]) for part in self.parts.values()]
+        residuals = sum(int((part.rows[:, :_POSE] != 0).any(1).sum()) for part in some)
+        count = residuals - _POSE * int(self.good.sum())
+        return _Whole.of(summed_products(some, _POSE, self.shared_size), count)
 
     def told(self, camera: int, white: Tensor) -> tuple[ViewData, PriorFamilies]:
         """Evidence of the good boards on their motions before a camera, with poses and shared unknowns integrated out.
@@ -224,7 +223,7 @@ class RigRows:
             camera: its number.
             white: (V, 12, 2 N) derivatives of the camera's whitened residuals by motions.
         """
-        whole, (_, shared, rows) = self._all(), self.parts[camera]
+        whole, (_, shared, rows) = self.whole, self.parts[camera]
         moving, rows = white[self.good], rows[self.good]
         # Products with the poses, such that squares of them are what poses explain.
         by_pose = torch.linalg.solve_triangular(whole.pose, (moving @ rows[:, :_POSE].mT).mT, upper=False).mT

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kcal.arrow import ArrowRows, arrow_table
-from kcal.calibrate.rig.adjustment import Adjustment, all_of
+from kcal.calibrate.rig.adjustment import Adjustment
 from kcal.calibrate.rig.initial_poses import TurnedBoard
 from kcal.calibrate.rig.problem import RigSolution
 from kcal.calibrate.rig.sources import RigData
@@ -305,7 +305,7 @@ def records(work: Adjustment, mask: Tensor, reasons: Reasons) -> Records:
         reasons: why others could not take part, where that is known.
     """
     telling = [source.marked.flatten(1).sum(-1) >= source.told_by for source, _ in work.sources]
-    outside = ~mask & all_of(telling, mask[:0])
+    outside = ~mask & torch.cat([mask[:0], *telling])
     if bool(outside.any()):
         work.solve(outside, LMOptions(residual_floor=1e-8), held=True)
     square, freedom = work.squares(mask), work.freedom(mask)

@@ -17,7 +17,7 @@ from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.parameters import FreeParameters
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.problem.views import spread_out
-from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, all_of, possible
+from kcal.calibrate.rig.adjustment import LOSS, ROUGHLY, Adjustment, possible
 from kcal.calibrate.rig.assess import rig_result
 from kcal.calibrate.rig.contradictions import widen_sources
 from kcal.calibrate.rig.explanations import (
@@ -365,7 +365,7 @@ def _first_mask(initial: InitialPoses, *, reject: bool) -> tuple[Tensor, Reasons
         reasons.update({count + i: text for i, text in foreign.items()})
         masks.append(enough)
         count += len(enough)
-    return all_of(masks, torch.zeros(0, dtype=torch.bool)), reasons
+    return torch.cat([torch.zeros(0, dtype=torch.bool), *masks]), reasons
 
 
 def _what_may_change(data: RigData, options: RigOptions) -> tuple[RigData, SharedUnknowns, list[Finding]]:
