@@ -95,9 +95,9 @@ def center_covariance(
     noise = (found + known * common[:, None]) / (freedom + known)
     enough = _sum_usable(count, usable) >= _MIN_PIXELS
     # The same sums over pixels `apart`, for the usable corners of each image together.
-    whiten = torch.where(usable & (noise > 0), noise, math.inf).rsqrt()
-    odd, pair = (odd * whiten[..., None]).flatten(1), (pair * usable[..., None]).flatten(1)
-    ahead, behind = (ahead * usable[..., None, None]).flatten(1), behind.flatten(1)
+    whiten = torch.where(noise > 0, noise, math.inf).rsqrt()[..., None]
+    odd, pair = (torch.where(usable[..., None], of, 0.0).flatten(1) for of in (odd * whiten, pair))
+    ahead, behind = (torch.where(usable[..., None, None], of, 0.0).flatten(1) for of in (ahead, behind))
     moving = gain[..., :2, :]
     smeared = torch.zeros_like(moving)
     for down, right in itertools.product(range(_CORRELATED + 1), range(-_CORRELATED, _CORRELATED + 1)):
@@ -161,7 +161,7 @@ MIN_RADIUS = 2.5  # pixels: fewer would not determine ten parameters
 # The next line is left out where it is more sigmas of blur from the window's rim: 3e-4 of the contrast.
 REACH = 3.5
 _FIRST_STEPS, _STEPS = 4, 20
-_COARSE_RADIUS = 8.0  # pixels: from here on every fourth pixel is enough for the first steps
+_COARSE_RADIUS = 8.0  # pixels: from here on every fifth pixel is enough for the first steps
 _CONVERGED = 1e-5  # pixels: the next step would be shorter; in float64 a tenth of it
 _FLOOR = 1e-7  # of the scaled normal matrix: what float32 leaves of it
 

@@ -111,6 +111,10 @@ class TestCorners:
         assert 0.1 < ratio.real.min() < 0.95
         assert ratio.real.max() < 10.0
         np.testing.assert_allclose(found[0].numpy(), wanted, rtol=1e-6, atol=1e-9 * wanted.max())
+        # What a corner that failed left behind is nothing to the others.
+        residual[~usable] = jacobian[~usable] = math.nan
+        again = center_covariance(residual, weight, jacobian, inverse, torch.zeros(1, count, 2), usable, 0.0)
+        assert bool((again == found)[usable].all())
 
     def test_least_noise_and_few_pixels(self) -> None:
         """Below two thousand pixels noise is white; rounding of gray levels is the least."""
