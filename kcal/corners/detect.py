@@ -537,8 +537,7 @@ def image_and_hash(source: Any) -> tuple[Any, str | None]:
 
 
 def _too_small(image: Gray) -> str:
-    height, width = image.shape
-    return f"the image has only {width}x{height} pixels" if min(width, height) < _SMALLEST else ""
+    return f"the image has only {image.shape[1]}x{image.shape[0]} pixels" if min(image.shape) < _SMALLEST else ""
 
 
 def _renumbered(

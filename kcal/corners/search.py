@@ -437,11 +437,7 @@ def refine_through_sizes(image: Gray, pixels: Tensor, board: Board, factor: floa
     corners 3 px off, too far for full size. Squares too small for refinement are left as they are.
     """
     whole = image.shape[1], image.shape[0]
-    factors = []
-    factor = 4 * factor
-    while factor > 1:
-        factors.append(factor)
-        factor = factor / 2
+    factors = [smaller for n in range(12) if (smaller := 4 * factor / 2**n) > 1]
     # Each is reduced from the one twice as large, because reducing the largest image takes the time.
     steps, source = [], image
     for factor in reversed(factors):

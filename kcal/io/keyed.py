@@ -38,9 +38,9 @@ _ROLES: dict[str, tuple[str, Sequence[int]]] = {
     "sigmas": ("std(?:ard)?dev(?:iation)?s?(?:intrinsics)?", range(4, 19)),
     "rotation": ("(?:stereo)?(?:r|rot(?:ation)?(?:matrix|mat|vector|vec)?|rmat)", (3, 9)),
     "translation": ("(?:stereo)?(?:t|trans(?:lation)?(?:vector|vec)?|tvec)", (3,)),
-    # ORB-SLAM3's first camera from the second, and OKVIS's body from a camera.
+    # ORB-SLAM3's first camera from the second, OKVIS's body from a camera, and MC-Calib's first camera from one.
     "second": ("(?:stereo)?tc1c2|tlr", (12, 16)),
-    "body": ("tsc", (16,)),
+    "body": ("tsc|(?<=camera)posematrix", (16,)),
     "binning_x": ("binningx?", (1,)),
     "binning_y": ("binningy", (1,)),
     "roi": ("roi|regionofinterest", (-1,)),
@@ -302,6 +302,8 @@ def _flattened(content: Mapping[str, Any]) -> dict[str, Any]:
     if "mu" in found and "k5" in found:
         # camodocal counts the coefficients of its fisheye from k2.
         found = {f"k{int(key[1]) - 1}" if re.fullmatch("k[2-5]", key) else key: value for key, value in found.items()}
+    if "camera_pose_matrix" in found and (number := found.get("distortion_type")) in (0, 1):
+        found["distortion_type"] = "fisheye" if number else "radtan"  # as MC-Calib counts lenses
     return found
 
 
@@ -412,6 +414,9 @@ def _poses(
 ) -> tuple[Pose, ...]:
     """Of each camera, or of the second one of two from the first."""
     meters = hints.meters or 1.0
+    if len({str(part.keys.get("camera_group")) for part, _ in parts if part is not named}) > 1:
+        notes.append("camera_group: the cameras are not of one group, and have no common frame: no pose is read")
+        return ()
     each = [part is not named and (part.get("body", side) is not None or
             (part.get("rotation", side) is not None and part.get("translation", side) is not None))
             for part, side in parts]  # fmt: skip

@@ -9,7 +9,7 @@ import gzip
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import Command
+from numpy.typing import NDArray
 from scipy.io import savemat
 
 from kcal.errors import FileError
@@ -514,6 +515,23 @@ PART = SIZE | {"K": M, "D": D}
 TURN = {"R": MOVE[:3, :3].tolist(), "T": MOVE[:3, 3].tolist()}
 
 
+def mc_calib(camera_in_first: NDArray[Any], *, lens: Sequence[float] = D, kind: int = 0, group: int = 0) -> Any:
+    """A camera of `calibrated_cameras_data.yml`."""
+    matrices = {"camera_matrix": M, "distortion_vector": [list(lens)], "camera_pose_matrix": camera_in_first.tolist()}
+    return matrices | {"distortion_type": kind, "camera_group": group, "img_width": 640, "img_height": 480}
+
+
+def test_lenses_and_groups_of_mc_calib(tmp_path: Path) -> None:
+    fisheye = mc_calib(BACK, lens=[0.01, -0.005, 0.002, 0.0], kind=1)
+    found = import_cameras(written(tmp_path, "a.json", {"camera_0": mc_calib(np.eye(4)), "camera_1": fisheye}))
+    assert [camera.model.fisheye for camera in found.cameras] == [False, True]
+    assert [note for note in found.notes if "unit" not in note] == []
+    apart = {"camera_0": mc_calib(np.eye(4)), "camera_1": mc_calib(BACK, group=1)}
+    found = import_cameras(written(tmp_path, "b.json", apart))
+    assert found.poses == ()
+    assert "the cameras are not of one group" in found.notes[0]
+
+
 @pytest.mark.parametrize(
     "content",
     [
@@ -522,11 +540,12 @@ TURN = {"R": MOVE[:3, :3].tolist(), "T": MOVE[:3, 3].tolist()}
         {"Camera1.K": M, "Camera1.D": D, "Camera2.K": M, "Camera2.D": D, "Stereo.T_c1_c2": BACK.tolist()} | SIZE,
         {"Camera.K": M, "Camera.D": D, "Camera2.K": M, "Camera2.D": D, "Tlr": BACK[:3].tolist()} | SIZE,
         {"cameras": [OKVIS | {"T_SC": np.eye(4).ravel().tolist()}, OKVIS | {"T_SC": BACK.ravel().tolist()}]},
+        {"nb_camera": 2, "camera_0": mc_calib(np.eye(4)), "camera_1": mc_calib(BACK)},
     ],
 )
 def test_poses_of_pairs(tmp_path: Path, content: dict[str, Any]) -> None:
     found = import_cameras(written(tmp_path, "a.yaml", f"%YAML:1.0\n{json.dumps(content)}"))
-    assert found.names in (("left", "right"), ("cam0", "cam1"), ("0", "1"))
+    assert found.names in (("left", "right"), ("cam0", "cam1"), ("0", "1"), ("camera_0", "camera_1"))
     assert np.abs(found.rig().right_from_left_rotation.numpy() - MOVE[:3, :3]).max() < 1e-12
     assert found.rig().right_from_left_translation.tolist() == pytest.approx(MOVE[:3, 3])
 
