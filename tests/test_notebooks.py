@@ -17,18 +17,14 @@ IDS = [path.stem for path in NOTEBOOKS]
 
 
 def shown(notebook: Any) -> list[list[str]]:
-    """What each cell shows without digits and widths of columns: another processor's last digits differ."""
-
-    def likened(text: str) -> str:
-        return re.sub(r"[ ─═]+", " ", re.sub(r"[\d.]+", "#", text))
-
+    """What each cell shows, without digits and the blanks after them: another processor's last digits differ."""
     found = []
     for cell in notebook["cells"]:
         texts = []
         for output in cell.get("outputs", ()):
             data = output.get("data", {"text": output.get("text")})
             texts += sorted(data)
-            texts += [likened("".join(data.get(kind, ""))) for kind in ("text", "text/plain")]
+            texts += [re.sub(r"[\d.]+ *", "#", "".join(data.get(kind, ""))) for kind in ("text", "text/plain")]
         found.append(texts)
     return found
 

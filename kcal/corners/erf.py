@@ -205,8 +205,7 @@ class _FitInputs(NamedTuple):
 
     def of(self, some: Tensor) -> _FitInputs:
         lines = None if self.lines is None else LineDistances(*(value[some] for value in self.lines))
-        prior = RampPrior(*(value[some] for value in self.prior))
-        return _FitInputs(self.window.of(some), self.bend[some], prior, lines)
+        return _FitInputs(self.window.of(some), self.bend[some], self.prior.of_some(some), lines)
 
 
 def fit_crossings(

@@ -274,6 +274,10 @@ class RampPrior(NamedTuple):
         weight = torch.minimum(most, torch.where(known, noise / error.clamp_min(1e-9) ** 2, most))
         return RampPrior(slope, weight, error)
 
+    def of_some(self, some: Tensor) -> RampPrior:
+        """The prior of some of the corners."""
+        return RampPrior(*(value[some] for value in self))
+
     def diagonal(self) -> Tensor:
         """What it adds to the diagonal of the normal matrix, (M, 10)."""
         return torch.nn.functional.pad(self.weight[:, None].expand(-1, 2), (7, 1))

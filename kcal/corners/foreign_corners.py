@@ -174,11 +174,11 @@ def _from_opencv(path: Path, board: Board) -> tuple[dict[str, list[Corner]], tup
     stored = read_storage(read_bytes(path, MOST_BYTES), str(path))
     # A matrix of views by corners, or a matrix of each view, as cv::omnidir's data have them.
     points = stored.get("image_points", stored.get("imagePoints"))
-    if not isinstance(points, list | np.ndarray):
+    views = [np.asarray(view, float) for view in points] if isinstance(points, list | np.ndarray) else []
+    if not views or any(view.shape[-1:] != (2,) for view in views):
         raise ValueError("image_points of OpenCV's calibration sample, or imagePoints of its omnidir, are needed")
     size = stored.get("imageSize", [stored.get(name) for name in ("image_width", "image_height")])
-    views = [np.asarray(view, dtype=float).reshape(-1, 2) for view in points]
-    return _unweighted(views), None if None in size else _whole_size(size)
+    return _unweighted(view.reshape(-1, 2) for view in views), None if None in size else _whole_size(size)
 
 
 def _whole_size(sides: Any) -> tuple[int, int]:

@@ -28,7 +28,7 @@ MOVE_SHARE = 0.3  # of the smallest square side: no corner moves further
 MIN_FIT = 0.85  # share of the gray levels' variance that the quadratic must explain; 0.98 to 0.999 on real corners
 CONVERGED = 0.02  # pixels: the last step of a converged corner is at most this long
 
-_REPEATS, _AT_REST = 6, 1e-4  # at most, and pixels: the last step is shorter, where no gradient passes through
+_REPEATS = 6
 _HALF = 12  # of the patch: 0.5 rounding + MAX_MOVE + RADIUS + 1 bilinear + 3 sigma of blur, rounded up
 
 
@@ -114,8 +114,6 @@ def saddle(image: Tensor, pixels: Tensor, side: Tensor | float) -> Refined:
         step = step * (RADIUS / 2 * flat_scale / _safe_norm(step)).clamp(max=1.0)
         move = where + step - offset
         where = offset + move * (MAX_MOVE / _safe_norm(move)).clamp(max=1.0)
-        if not step.requires_grad and bool((_safe_norm(step) < _AT_REST).all()):
-            break
     moved = (where - offset).reshape(start.shape)
     result = start + moved
     margin = (RADIUS + 2 * BLUR) * scale

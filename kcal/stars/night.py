@@ -407,14 +407,9 @@ def _on_earth(among: NamedStars, catalog: night_sky.StarCatalog, camera: Camera)
     vacuum = view.directions(part, night_sky.Air(hectopascal=0.0))
     sigma = blurred[on_ground.star >= 0]
     doubt = refraction_doubt(on_ground, sigma, torch.from_numpy(there[used]), torch.from_numpy(vacuum), camera)
-    told = (day if sun > _TWILIGHT else None, rolled if abs(roll) > _ON_ITS_SIDE else None, doubt)
+    told = tuple(filter(None, (day if sun > _TWILIGHT else None, rolled if abs(roll) > _ON_ITS_SIDE else None, doubt)))
     return dataclasses.replace(
-        among,
-        attitude=on_ground,
-        directions=there,
-        on_earth=True,
-        covariance=covariance,
-        warnings=tuple(filter(None, told)),
+        among, attitude=on_ground, directions=there, on_earth=True, covariance=covariance, warnings=told
     )
 
 

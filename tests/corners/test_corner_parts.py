@@ -223,6 +223,7 @@ class TestLight:
         torch.testing.assert_close(prior.weight, torch.tensor([1e-6 / 1e-8, most, most]).double())
         assert prior.diagonal()[0].tolist() == [0.0] * 7 + [pytest.approx(100.0)] * 2 + [0.0]
         assert prior.value()[1].tolist() == [0.0] * 7 + [1.0, 1.0, 0.0]
+        assert prior.of_some(torch.tensor([True, False, False])).error.tolist() == pytest.approx([1e-4])
 
 
 def edges(first: float, second: float) -> Tensor:

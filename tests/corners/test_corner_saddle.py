@@ -144,6 +144,13 @@ def test_batch_equals_one_by_one(by, of, atol):
         assert bool((together.status[k] == one.status).all())
 
 
+def test_saddles_may_be_mapped():
+    image, _, start, side = scene(16)
+    light = torch.from_numpy(image).double()
+    mapped = torch.func.vmap(lambda one: saddle(one, start, side).pixels)(light[None])
+    torch.testing.assert_close(mapped[0], saddle(light, start, side).pixels, rtol=0, atol=1e-10)
+
+
 def test_gradient_with_respect_to_the_image():
     x = torch.arange(33.0, dtype=torch.float64)
     image = torch.outer(torch.tanh((x - 16.2) / 2), torch.tanh((x - 15.7) / 2))

@@ -220,10 +220,15 @@ def observations_of(
     return seen, "; ".join(common.notes)
 
 
+def calibration_options(model: str, options: BatchOptions) -> CalibrationOptions:
+    """How cameras of this model are calibrated."""
+    return CalibrationOptions(model=model, board_warp=options.board_warp)
+
+
 def calibrate_again(seen: Observations, options: BatchOptions, model: str = HYBRID) -> CameraCalibrationResult:
     """One camera, with all that its calibration tells."""
     with work_limit(options.time_limit):
-        return calibrate_camera(seen, CalibrationOptions(model=model, board_warp=options.board_warp))
+        return calibrate_camera(seen, calibration_options(model, options))
 
 
 def calibrated(result: CameraCalibrationResult, name: str) -> Calibrated:

@@ -32,6 +32,7 @@ from kcal.calibrate.batch.jobs import (
     calibrate_again,
     calibrate_observations,
     calibrated,
+    calibration_options,
     detect_image,
     hash_of,
     observations_of,
@@ -39,7 +40,7 @@ from kcal.calibrate.batch.jobs import (
     sharing_jobs,
 )
 from kcal.calibrate.camera.calibrate import ALONE, sharing
-from kcal.calibrate.camera.result import HYBRID, CalibrationOptions, CameraCalibrationResult
+from kcal.calibrate.camera.result import HYBRID, CameraCalibrationResult
 from kcal.corners.detect import limit_threads
 from kcal.corners.images import image_bytes
 from kcal.corners.observations import Observations
@@ -244,7 +245,7 @@ class Results:
                 alone = self._each(calibrate_again, {i: (self._views[i], self.options) for i in good}, crew)
                 found = sharing(
                     [alone[i] for i in good],
-                    CalibrationOptions(model=HYBRID, board_warp=self.options.board_warp),
+                    calibration_options(HYBRID, self.options),
                     one_type=self.options.one_type,
                     run=lambda function, tasks: self._each(function, tasks, crew).items(),
                 )

@@ -198,6 +198,7 @@ def calibrate_camera(
         wrong |= {i: wrong[first] for i, first in copied.items() if first in wrong}
         progress(f"again without {len(wrong)} views of another camera")
         return without_views(calibrate_camera(leaving_out(observations, wrong), options, progress), observations, wrong)
+    # Copies come back as views that were left out, and what views do not add is doubted.
     names, views = observations.names, checked.observations.pixels()
     more = (*copy_findings(names, copied), *pose_findings(views), *unit_findings(checked))
     residuals = dict(zip((i for i in range(len(names)) if i not in copied), checked.per_view_rms.tolist(), strict=True))

@@ -346,12 +346,11 @@ class ParameterConstraints:
             raise InputError(f"parameter {min(twice)} is tied twice: write one tie with all parameters that are equal")
         for name, prior in self.priors.items():
             try:
-                mean, sigma = map(float, prior)
+                mean, sigma = prior
+                sound = math.isfinite(mean) and math.isfinite(sigma) and sigma > 0
             except (TypeError, ValueError) as error:
-                raise InputError(
-                    f"prior of {name} is {prior!r}; a pair (mean, standard deviation) is needed"
-                ) from error
-            if not (math.isfinite(mean) and math.isfinite(sigma) and sigma > 0):
+                raise InputError(f"prior of {name} is {prior!r}; a pair (mean, sigma) is needed") from error
+            if not sound:
                 raise InputError(f"prior of {name} is {mean} ± {sigma}; it needs a positive standard deviation")
 
     def free_parameters(self, model: LensModel) -> FreeParameters:
