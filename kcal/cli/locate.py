@@ -103,7 +103,7 @@ class LocateOptions:
     height: kinds.Height | None = None
     terrain: Rare[kinds.Raster | None] = None
     terrain_sigma: Rare[Annotated[float, Kind(metavar="M", least=0.01, of="terrain")]] = 3.0
-    geoid: Annotated[Rare[kinds.Meters], Kind(of="terrain")] = 0.0
+    geoid: Annotated[Rare[kinds.Meters | None], Kind(of="terrain")] = None
     geoid_grid: Rare[Path | None] = None
 
     def __post_init__(self) -> None:

@@ -343,7 +343,7 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
         error = kcal.rig.RasterError(refraction=given.refraction.value, refraction_sigma=given.refraction_sigma)
         if given.terrain_sigma is not None:
             error = dataclasses.replace(error, sigma=given.terrain_sigma, offset=0.5 * given.terrain_sigma)
-        ground = kcal.locate.terrain(raster, given.geoid or 0.0)
+        ground = kcal.locate.terrain(raster, given.geoid)
         cameras = list(read.cameras.values())
         source, found = kcal.rig.skyline_source(images, cameras, ground, read.origin, centers, sigma, error=error)
     shown = [(image.name, image.image) for image in images]
@@ -527,7 +527,9 @@ def _add_positions(read: RigReading, path: Path) -> None:
     """Places of the cameras."""
     placed = _places_in(read, path)
     read.origin = placed.origin
-    read.add("positions", rooms.camera_positions(placed, tuple(read.cameras)))
+    # Two cameras are left and right, or named as their files.
+    own = tuple(read.cameras)
+    read.add("positions", rooms.camera_positions(placed, own if {*placed.names} <= {*own} else read.names))
 
 
 def _add_landmarks(read: RigReading, path: Path) -> None:

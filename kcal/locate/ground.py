@@ -23,7 +23,8 @@ from kcal.texts import brief
 if TYPE_CHECKING:
     import pyproj
 
-    _Read = tuple[NDArray[np.float64], tuple[float, float, float, float, float, float], pyproj.CRS]
+    # Heights, `Raster.to_cell`, coordinate system, and the unit of heights where the file tells it beside that.
+    _Read = tuple[NDArray[np.float64], tuple[float, float, float, float, float, float], pyproj.CRS, str]
 
 # Rasters of ground heights, which `terrain` reads: GeoTIFF and what else rasterio knows, or an ESRI ASCII grid.
 
@@ -87,19 +88,22 @@ class Raster:
         return np.where(inside, found, np.nan)
 
 
-def terrain(path: str | Path, geoid_height: float = 0.0) -> Raster:
+def terrain(path: str | Path, geoid_height: float | None = None) -> Raster:
     r"""Ground from a raster of heights, for example a GeoTIFF, interpolated between the middles of its cells.
 
     An ESRI ASCII grid (.asc) is read without further packages: in the coordinate system of the .prj file beside it, or
-    in degrees, if its numbers are such. Other rasters need the extra `terrain`.
+    in degrees, if its numbers are such. Other rasters need the extra `terrain`. A raster's own scale, offset and unit of
+    heights are heeded.
 
     Args:
         path: a raster with a coordinate system.
-        geoid_height: meters that are added, for a raster of heights above the sea: the height of the geoid there.
+        geoid_height: meters that are added, for a raster of heights above the sea: the height of the geoid there. Needed
+            where the coordinate system says that its heights are such.
 
     Raises:
-        InputError: rasterio is missing, or a height that is not finite.
-        FileError: not a raster, one without coordinate system, or of more than 200 million cells.
+        InputError: rasterio is missing, or a height that is not finite; heights above the sea without `geoid_height`.
+        FileError: not a raster, one without coordinate system, or of more than 200 million cells; heights in a unit
+            that is none of length.
 
     Example:
         >>> import tempfile
@@ -111,18 +115,21 @@ def terrain(path: str | Path, geoid_height: float = 0.0) -> Raster:
         >>> ground(*torch.tensor([[45.01], [6.01]], dtype=torch.float64)).round(decimals=6).tolist()
         [25.0]
     """
-    if not math.isfinite(geoid_height):
+    if not math.isfinite(geoid_height or 0.0):
         raise InputError(f"geoid height {geoid_height}: finite meters are needed")
     import pyproj  # which a rig without terrain does not need
 
     read_head(path, 0)
     read = _read_grid if Path(path).suffix.lower() == ".asc" else _read_raster
-    heights, to_cell, system = read(Path(path))
+    heights, to_cell, whole, unit = read(Path(path))
+    if geoid_height is None and (above := [part.name for part in whole.sub_crs_list if part.is_vertical]):
+        raise InputError(f"{path}: its heights are above the sea ({above[0]}): give the height of the geoid there")
+    system, heights = whole.to_2d(), heights * _meters(path, unit, whole)
     if not all(map(math.isfinite, to_cell)):
         raise FileError(f"{path}: its cells have no size on the ground")
     if np.isinf(heights).any():
         raise FileError(f"{path}: a height is infinite")
-    heights = heights + geoid_height
+    heights = heights + (geoid_height or 0.0)
     into = None
     if not (system.is_geographic and pyproj.CRS("EPSG:4326").datum == system.datum):
         into = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
@@ -145,6 +152,21 @@ def terrain(path: str | Path, geoid_height: float = 0.0) -> Raster:
     return Raster(heights, to_cell, into, min(sides))
 
 
+def _meters(path: str | Path, unit: str, system: pyproj.CRS) -> float:
+    """Length of the unit of a raster's heights: the one that the file names, or that of a third axis."""
+    from pyproj.database import get_units_map
+
+    if not unit:
+        return system.axis_info[2].unit_conversion_factor if len(system.axis_info) == 3 else 1.0
+    known = {"meter": 1.0, "feet": 0.3048}
+    for one in get_units_map(category="linear").values():
+        known |= dict.fromkeys((one.name.lower(), one.proj_short_name), one.conv_factor)
+    name = unit.strip().lower()
+    if (length := known.get(name) or known.get(name.removesuffix("s"))) is None:
+        raise FileError(f"{path}: its heights are in {unit!r}, which is no known unit of length")
+    return length
+
+
 def _check_cells(path: Path, columns: int, rows: int) -> None:
     if columns * rows > _MOST_CELLS:
         raise FileError(f"{path}: {columns} x {rows} cells; at most {_MOST_CELLS:,} are read: cut out what is needed")
@@ -157,6 +179,7 @@ def _read_raster(path: Path) -> _Read:
         with rasterio.open(path) as raster:
             _check_cells(path, raster.width, raster.height)
             heights = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
+            heights, unit = heights * raster.scales[0] + raster.offsets[0], raster.units[0] or ""
             if raster.transform.is_degenerate:
                 raise FileError(f"{path}: its cells have no size on the ground")
             system, to_cell = raster.crs, ~raster.transform
@@ -164,7 +187,7 @@ def _read_raster(path: Path) -> _Read:
         raise FileError(f"{path}: cannot be read as a raster: {error}") from error
     if system is None:
         raise FileError(f"{path}: the raster has no coordinate system")
-    return heights, tuple(to_cell)[:6], _coordinate_system(path, system.to_wkt())
+    return heights, tuple(to_cell)[:6], _coordinate_system(path, system.to_wkt()), unit
 
 
 def _coordinate_system(path: Path, text: str) -> pyproj.CRS:
@@ -217,7 +240,7 @@ def _read_grid(path: Path) -> _Read:
         system = pyproj.CRS("EPSG:4326")
     else:
         raise FileError(f"{path}: its numbers are not degrees; put the coordinate system beside it as {projection}")
-    return heights, (1 / cell, 0.0, -x / cell, 0.0, -1 / cell, rows + y / cell), system
+    return heights, (1 / cell, 0.0, -x / cell, 0.0, -1 / cell, rows + y / cell), system, ""
 
 
 # A line of sight is followed outward until it is below the ground for the first time: what lies behind is hidden. Light

@@ -311,7 +311,8 @@ class _Gather:
         if camera not in self.number:
             if self.others:
                 return
-            raise FileError(f"{row.where}: no camera is named {camera!r}; they are {', '.join(self.cameras)}")
+            order = ", in the order in which the rig was solved" if tuple(self.cameras) == PAIR else ""
+            raise FileError(f"{row.where}: no camera is named {camera!r}; they are {', '.join(self.cameras)}{order}")
         key = row.name, row.cells.get("time", "")
         place = self.rows.setdefault(key, len(self.rows)), self.number[camera]
         if place[0] == len(self.first):

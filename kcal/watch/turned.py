@@ -288,7 +288,8 @@ class Drift:
             # Turning the right camera by ω about its x, y, z moves a point's image; the range follows the disparity.
             rows = torch.stack([_range_slope(new, points, axis) for axis in torch.eye(3, dtype=torch.float64)], -1)
         sigma = (rows @ self.relative_covariance * rows).sum(-1).clamp_min(0.0).sqrt()
-        return DriftEffect(far, found, sigma)
+        # A turn changes 1 / range alike at all ranges, and the old rig finds the point at another one.
+        return DriftEffect(far, found, sigma * (found / far).square())
 
     @in_one_thread
     def relocked(self, note: str) -> Rig:

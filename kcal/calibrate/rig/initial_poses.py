@@ -69,7 +69,7 @@ def first_poses(data: RigData, solver: LMOptions) -> InitialPoses:
                     "position or the baseline"
                 )
         starts = _in_all_places(data, _starts(known, tried[:_AT_ONCE]))
-        views.tried = tried[_AT_ONCE:]
+        views.tried = tried
         if data.absolute and not placed:
             starts = [_into_frame(data, start) for start in starts]
     views.turn_all()
@@ -83,9 +83,12 @@ def _stacked(known: _Known) -> tuple[Tensor, Tensor]:
 
 
 def _level_starts(data: RigData) -> list[Start] | None:
-    """Starts for cameras whose positions are all measured and that only features connect: level, in eight headings."""
+    """Starts for cameras whose positions are all measured and that only features connect: level, in eight headings.
+
+    Of two cameras the direction from one to the other is found instead, and then turned to the measured one.
+    """
     places = {p.camera: p.point for p in reversed(data.positions)}
-    if _far_pixels(data) is None or data.boards is not None or len(places) < len(data.cameras):
+    if _far_pixels(data) is None or data.boards is not None or len(places) < max(len(data.cameras), 3):
         return None
     known = {0: Pose.still()}
     for _ in data.cameras:

@@ -82,8 +82,6 @@ _EXACT = 0.01
 _POSE = 6
 # Prior width of shared unknowns, as movement of corners in standard deviations of their noise: nearly no prior.
 _WIDE = 1e3
-# Share of what is seen of motions that combinations of shared unknowns explain, below which they are none of theirs.
-_UNFELT = 1e-10
 # Readouts by which exposures must be apart to be called apart.
 _OTHER_MOMENT = 0.4
 # Of fewer boards, one that is wrong cannot be told from motion.
@@ -216,8 +214,8 @@ class RigRows:
     def told(self, camera: int, white: Tensor) -> tuple[ViewData, PriorFamilies]:
         """Evidence of the good boards on their motions before a camera, with poses and shared unknowns integrated out.
 
-        Shared unknowns enter as combinations that are independent and of unit weight where all boards stand still.
-        Those that explain nothing of any motion are left out: most are of other cameras.
+        Shared unknowns enter as combinations that are independent and of unit weight where all boards stand still: those
+        that the boards' poses or the camera feel. Most others are of other cameras.
 
         Args:
             camera: its number.
@@ -227,30 +225,25 @@ class RigRows:
         moving, rows = white[self.good], rows[self.good]
         # Products with the poses, such that squares of them are what poses explain.
         by_pose = torch.linalg.solve_triangular(whole.pose, (moving @ rows[:, :_POSE].mT).mT, upper=False).mT
-        cross = -by_pose @ whole.half
-        cross[..., torch.cat([shared, shared.new_tensor([-1])])] += moving @ rows[:, _POSE:].mT
-        by_shared = cross[..., :-1].flatten(0, 1).T * whole.scale[:, None]
-        felt = torch.linalg.solve_triangular(whole.root, by_shared, upper=False)
+        direct = moving @ rows[:, _POSE:].mT
         own = moving @ moving.mT - by_pose @ by_pose.mT
-        alone = own.diagonal(dim1=-2, dim2=-1).flatten()
-        share = felt * torch.where(alone > 0, alone.rsqrt(), 0.0)
-        # Both products have the same eigenvalues beside zeros; the smaller one takes less time.
-        few = len(share) <= share.shape[1]
-        explained, basis = torch.linalg.eigh(share @ share.T if few else share.T @ share)
-        basis = basis[:, explained > _UNFELT]
-        if not few:
-            basis = torch.linalg.qr(share @ basis)[0]
-        felt, pull = basis.T @ felt, basis.T @ whole.pull
+        seen = torch.zeros_like(whole.root[:, : len(shared)])
+        seen[shared, range(len(shared))] = whole.scale[shared]
+        seen = torch.linalg.solve_triangular(whole.root, seen, upper=False)
+        basis, felt = torch.linalg.qr(torch.cat([whole.posed, seen], 1))
+        by_poses, by_seen = felt.split([whole.posed.shape[1], len(shared)], 1)
+        cross = direct[..., :-1] @ by_seen.T - by_pose @ by_poses.unflatten(1, (-1, _POSE)).permute(1, 2, 0)
+        cross = torch.cat([cross, direct[..., -1:] - by_pose @ whole.half[..., -1:]], -1)
+        pull = basis.T @ whole.pull
         square = whole.square - float(whole.pull.square().sum() - pull.square().sum())
         # Of more unknowns than motions, some are determined by nothing.
-        many = len(alone) < len(basis)
+        many = own.shape[0] * own.shape[1] < len(basis)
         freedom = whole.freedom - ((whole.determined if many else len(basis)) - len(pull))
         size = len(pull)
         products = torch.eye(size + 1, dtype=pull.dtype)
         products[-1, :-1] = products[:-1, -1] = pull
         products[-1, -1] = square
         still = Quadratic(products, freedom, torch.zeros_like(pull))
-        cross = torch.cat([felt.T.unflatten(0, (len(moving), -1)), cross[..., -1:]], -1)
         data = ViewData(still=still, own=own, cross=cross, score=pull.new_zeros(len(moving), size))
         zero, none = torch.zeros_like(pull), torch.full(pull.shape, -1)
         return data, PriorFamilies(zero, torch.full_like(pull, math.log(_WIDE)), none, none, zero)
@@ -265,6 +258,7 @@ class _Whole(NamedTuple):
         scale: (S,) of what boards share; zero where nothing depends on it.
         root: (S, S) lower triangle of its products in this scale, what is hardly known included.
         pull: (S,) products with the residuals, in combinations of unit weight.
+        posed: (S, 6 V) what the boards' poses feel of these combinations.
         determined: how many of these combinations the boards determine.
         freedom: residuals, less those that poses take up.
         square: of all residuals.
@@ -276,6 +270,7 @@ class _Whole(NamedTuple):
     scale: Tensor
     root: Tensor
     pull: Tensor
+    posed: Tensor
     determined: float
     freedom: int
     square: float
@@ -298,9 +293,10 @@ class _Whole(NamedTuple):
         matrix.diagonal().add_(torch.where(length > 0, weak, 1.0))
         root = torch.linalg.cholesky(matrix)
         pull = torch.linalg.solve_triangular(root, (total[:-1, -1] * unit)[:, None], upper=False)[:, 0]
+        posed = torch.linalg.solve_triangular(root, flat[:, :-1].T * unit[:, None], upper=False)
         inverse = torch.linalg.solve_triangular(root, torch.diag((length > 0).to(root.dtype)), upper=False)
         determined = int((length > 0).sum()) - weak * float(inverse.square().sum())
-        return cls(pose, half, unit, root, pull, determined, count, square, variance)
+        return cls(pose, half, unit, root, pull, posed, determined, count, square, variance)
 
 
 class WithoutMotion:

@@ -97,7 +97,7 @@ _CORNER_SIGMA = 0.2
 # Times that each camera is moved at most.
 _ROUNDS = 3
 # Enough steps, and features, to tell which of several starts is best.
-_SCREENING, _SCREENED = LMOptions(max_iterations=25, tolerance=1e-6, residual_floor=1e-8), 300
+_SCREENING, _SCREENED = LMOptions(max_iterations=60, tolerance=1e-6, residual_floor=1e-8), 300
 
 
 def robust_solution(initial: InitialPoses, mask: Tensor, unknowns: SharedUnknowns) -> Adjustment:
@@ -113,7 +113,9 @@ def robust_solution(initial: InitialPoses, mask: Tensor, unknowns: SharedUnknown
             break
         before = best.cost
         for camera in initial.tried:
-            moved = [*around(best.start, camera), mirrored(best.start)]
+            # From where the best one came to: of steps that are slow, a wrong start may take the lead at first.
+            reached = best.start._replace(rotation=best.work.state.rotation, center=best.work.state.center)
+            moved = [*around(reached, camera), mirrored(reached)]
             best = best_of([initial.with_boards(start) for start in moved], best)
     work, here = best.work, possible(best.work, mask)
     work.unknowns = unknowns

@@ -257,6 +257,61 @@ def test_many_cameras_of_features_and_baselines_alone() -> None:
     assert float(vector_from_rotation(turned).abs().max()) < 1e-3
 
 
+def matches(seed: int, near: int, far: int, heading: float, count: int = 2) -> tuple[Features, Tensor, Tensor]:
+    """Of level cameras 10 m apart, 50 to 1500 m away and of unknown range, or at 20 ± 2 km; rotations and centers."""
+    draw = generator(seed)
+    uniform = functools.partial(torch.rand, dtype=torch.float64, generator=draw)
+    sine, cosine = math.sin(heading), math.cos(heading)
+    level = tensor([cosine, -sine, 0.0], [0.0, 0.0, -1.0], [sine, cosine, 0.0])
+    rotation = torch.stack([rotation_from_vector(0.02 * (uniform(3) - 0.5)) @ level for _ in range(count)])
+    center = 10.0 * torch.arange(count).double()[:, None] * level[0] + uniform(count, 3)
+    turn, rise = 0.7 * (uniform(near + far) - 0.5), 0.3 * (uniform(near + far) - 0.5)
+    away = torch.cat([50.0 * 30.0 ** uniform(near), torch.full((far,), 2e4).double()])
+    points = torch.stack([away * turn.sin(), away * rise, away * turn.cos()], -1) @ level
+    camera = CAMERAS[0]
+    seen = [camera.project((points - c) @ r.T)[0] for r, c in zip(rotation, center, strict=True)]
+    noise = 0.2 * torch.randn(near + far, count, 2, dtype=torch.float64, generator=draw)
+    known = torch.arange(near + far) >= near
+    found = Features(
+        names=tuple(f"match {i}" for i in range(near + far)),
+        pixels=torch.stack(seen, 1) + noise,
+        inverse_range=torch.where(known, 1.0 / away, 1e-3),
+        inverse_range_sigma=torch.where(known, 0.1 / away, math.inf),
+        pixel_sigma=0.2,
+    )
+    return found, rotation, center
+
+
+def check_attitudes(found: Tensor, truth: Tensor) -> None:
+    """Of the second camera to the first one."""
+    turned = found[1] @ found[0].T @ truth[0] @ truth[1].T
+    assert math.degrees(float(vector_from_rotation(turned).norm())) < 0.1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_far_point_of_known_range_leaves_no_mirror_image(seed: int) -> None:
+    """It fixes the yaw, towards which steps are slow: after few of them, the mirror image had the lower cost."""
+    seen, rotation, center = matches(seed, 30, 1, 0.0)
+    tape = Baseline(first=0, second=1, length=float((center[1] - center[0]).norm()), sigma=0.005)
+    rig = RigData(cameras=CAMERAS[:1] * 2, names=NAMES[:2], features=seen, baselines=(tape,))
+    found = solve_rig(rig, RigOptions(refraction=0.0, refraction_sigma=0.0))
+    assert found.left_out == ()
+    check_attitudes(found.rotation, rotation)
+    assert float(found.rotation[0, 0] @ (found.center[1] - found.center[0])) > 9.0
+
+
+@pytest.mark.parametrize("heading", [20.0, 35.0, 200.0])
+@pytest.mark.parametrize("count", [2, 3])
+def test_measured_positions_and_matches_in_any_heading(heading: float, count: int) -> None:
+    seen, rotation, center = matches(1, 30, 0, math.radians(heading), count)
+    sigma = torch.full((3,), 0.02).double()
+    measured = tuple(MeasuredPosition(camera=c, point=center[c], sigma=sigma) for c in range(count))
+    rig = RigData(cameras=CAMERAS[:1] * count, names=NAMES[:count], features=seen, positions=measured)
+    found = solve_rig(rig, RigOptions(refraction=0.0, refraction_sigma=0.0))
+    assert found.left_out == ()
+    check_attitudes(found.rotation, rotation)
+
+
 class TestPlaces:
     def test_lengths_between_cameras(self) -> None:
         measured = (Baseline(first=0, second=1, length=10.5, sigma=0.01),)
