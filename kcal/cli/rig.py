@@ -149,7 +149,7 @@ def solve_and_write(
         raise InputError("--scene is for rigs of two cameras; give matches as a table by --features")
     cameras = rig_sources.load_cameras(paths)
     if two:
-        rig_sources.check_sides(cameras, paths)
+        rig_sources.check_sides(cameras, paths, sources.pairs or ())
     read = rig_sources.read_sources(cameras, sources, names, paths)
     with (
         console.ending_with(lambda error: rig_sources.cure_of_all(error, sources, paths)),
@@ -489,6 +489,7 @@ def rig_check_command(
     if drift.variance > 1:
         times = f"{drift.variance**0.5:.1f} times"
         warn(f"residuals are {times} as large as the marks' noise says; sigmas were multiplied by that")
+    warn(*(f"{text}: its turn is wrong" for text in drift.moved))
     if drift.significant:
         print_styled("the relative attitude has changed beyond chance: ranges by the old rig are wrong", "changed")
     else:

@@ -371,12 +371,17 @@ def _lines(image: kcal.rig.SkylineImage, names: Sequence[str], found: rooms.Skyl
 _SIDE = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 
 
-def check_sides(cameras: Sequence[kcal.Camera], paths: Sequence[Path]) -> None:
+def check_sides(cameras: Sequence[kcal.Camera], paths: Sequence[Path], pairs: Sequence[Path]) -> None:
     """Refuse a left camera that is named right, and a right one that is named left.
+
+    Not where each is given its own views: then the names were wrong, and the solution tells who stands where.
 
     Raises:
         InputError: with the command in which they are exchanged.
     """
+    records = [camera.calibration.record if camera.calibration else None for camera in cameras]
+    if pairs and [record and record.observations for record in records] == [path.name for path in pairs]:
+        return
     names = [camera.calibration.name if camera.calibration else "" for camera in cameras]
     sides = [set(map(str.lower, _SIDE.findall(name))) for name in names]
     if sides == [{"right"}, {"left"}]:

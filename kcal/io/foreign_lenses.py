@@ -21,6 +21,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.model import HybridForm, LensModel, radius_over_angle
 from kcal.lens.projection import angle_over_distance, project_components
 from kcal.lens.zernike import ZernikeModes
+from kcal.threads import in_one_thread
 
 Plane = tuple[Tensor, Tensor, Tensor]
 
@@ -269,10 +270,13 @@ def foreign_camera(
     return nearest_hybrid(ForeignCamera(kind, values, camera.size, name).unproject, camera, f"its {kind} lens", notes)
 
 
+@in_one_thread
 def nearest_hybrid(
     unproject: Callable[[Tensor], tuple[Tensor, Tensor]], like: Camera, title: str, notes: list[str]
 ) -> Camera:
-    """The hybrid camera through the rays that pixels (N, 2) have.
+    """The hybrid camera through the rays that pixels (N, 2) have; those without one have none in it, either.
+
+    Where the lens ends inside the image, so does the camera, or slightly before.
 
     Args:
         unproject: rays (N, 3) of pixels, and which have one.
@@ -285,26 +289,34 @@ def nearest_hybrid(
     """
     name = foreign.camera_name(like, "camera")
 
-    def lines(grid: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    def lines(grid: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
         pixels = like.grid(*grid).reshape(-1, 2)
         rays, good = unproject(pixels)
-        return rays[good], pixels[good]
+        return rays[good], pixels[good], pixels[~good]
 
-    rays, pixels = lines(_GRID)
+    rays, pixels, _ = lines(_GRID)
     if len(rays) < _GRID[0] * _GRID[1] // 4:
         raise ValueError(f"{name}: {title} has no ray for most of the image")
-    try:
-        camera, _ = hybrid_through(rays, pixels, like.size)
-    except DegenerateError as refused:
-        raise ValueError(f"{name}: no lens of kcal follows {title}: {refused}") from None
+    between, seen, dark = lines(_BETWEEN)
+    camera, why = None, "its rim would be guessed"
+    for reach in _REACHES:
+        try:
+            camera, _ = hybrid_through(rays, pixels, like.size, reach)
+        except DegenerateError as refused:
+            why = str(refused)
+            continue
+        if not bool(camera.unproject(dark)[1].any()):
+            break
+        camera = None
+    if camera is None:
+        raise ValueError(f"{name}: no lens of kcal follows {title}: {why}")
     camera.calibration = CameraCalibration(name=name)
-    rays, pixels = lines(_BETWEEN)
-    seen, shown = camera.project_rays(rays)
-    error = (seen - pixels)[shown].norm(dim=-1)
+    there, shown = camera.project_rays(between)
+    error = (there - seen)[shown].norm(dim=-1)
     rms, most = float(error.square().mean().sqrt()), float(error.max())
     if not most < _FAR:
         raise ValueError(f"{name}: no lens of kcal follows {title}: the nearest is {most:.2g} px off")
-    covered = float(len(rays) / (_BETWEEN[0] * _BETWEEN[1]))
+    covered = float(camera.unproject(like.grid(*_BETWEEN).reshape(-1, 2))[1].double().mean())
     rest = "" if covered == 1.0 else f"; {1.0 - covered:.1%} of the image has no ray"
     notes.append(f"{name}: {title} became kcal's hybrid lens, RMS {rms:.2g} px, at most {most:.2g} px{rest}")
     return camera
@@ -349,16 +361,19 @@ def fit_foreign(kind: str, camera: Camera) -> ForeignCamera:
 
 # A hybrid lens through given rays and pixels: lenses of other programs that no parametric model of kcal has.
 
-# Beyond the outermost ray, in proportion.
-_MARGIN = 1.05
+# How far the lens reaches, outermost rays being 1: beyond them, unless pixels there have no ray.
+_REACHES = (1.05, 1.0, 0.99, 0.98, 0.96, 0.93, 0.9, 0.86)
 _SHAPES = torch.linspace(-1.0, 1.2, 221, dtype=torch.float64)
 _STEPS = 4
 
 
-def hybrid_through(rays: Tensor, pixels: Tensor, size: tuple[int, int]) -> tuple[Camera, Tensor]:
+def hybrid_through(
+    rays: Tensor, pixels: Tensor, size: tuple[int, int], reach: float = _REACHES[0]
+) -> tuple[Camera, Tensor]:
     """The hybrid camera that comes nearest to pixels (N, 2) of rays (N, 3), and its errors (N, 2) in pixels.
 
-    By least squares, without an entrance pupil. The rays should reach all over the image.
+    By least squares, without an entrance pupil. The rays should reach all over the image; those beyond `reach`, as a
+    share of the outermost one's distance in the lens's plane, are left out, and their errors.
 
     Raises:
         DegenerateError: rays that no hybrid lens shows.
@@ -369,7 +384,10 @@ def hybrid_through(rays: Tensor, pixels: Tensor, size: tuple[int, int]) -> tuple
     focal = (plane * radius).sum(1) / plane.square().sum(1)
     off = (focal[:, None] * plane - radius).square().sum(1)
     best = int(torch.where(off.isfinite(), off, math.inf).argmin())
-    form = HybridForm(shape=float(_SHAPES[best]), radius=_MARGIN * float(plane[best].max()), modes=ZernikeModes())
+    limit = reach * float(plane[best].max())
+    form = HybridForm(shape=float(_SHAPES[best]), radius=limit, modes=ZernikeModes())
+    inside = plane[best] < limit
+    rays, pixels = rays[inside], pixels[inside]
     model = LensModel(hybrid=form)
     values = torch.zeros(5 + model.size, dtype=torch.float64)
     values[:4] = torch.stack([focal[best], focal[best], *middle])

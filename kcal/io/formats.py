@@ -225,7 +225,7 @@ def _json_format(path: Path, text: str) -> str:
         for name, marks in _JSON.items():
             if marks & set(content):
                 return name
-        other = next((program for key, program in _UNREAD.items() if key in content), "")
+        other = next((program for keys, program in _UNREAD.items() if {*keys.split()} <= {*content}), "")
         if other:
             raise FileError(f"{path}: a file of {other}, which kcal does not read; copy its numbers into one of Kalibr")
         if speaks_of_camera(json.dumps(content, indent=1)):
@@ -234,7 +234,9 @@ def _json_format(path: Path, text: str) -> str:
 
 
 # Keys that JSON files of a format have, and of programs whose files are not read.
-_UNREAD = {"views": "Meshroom", "sfm_data_version": "OpenMVG", "calib_dimension": "Gyroflow", "invpol": "OCamCalib"}
+_UNREAD = {
+    "sfm_data_version": "OpenMVG", "views intrinsics": "Meshroom", "calib_dimension": "Gyroflow", "invpol": "OCamCalib",
+}  # fmt: skip
 _UNREAD_TEXT = {
     "OCamCalib": "^#polynomial coefficients for the DIRECT", "Bundler": r"\A# Bundle file", "VisualSFM": r"\ANVM_V3",
     "Hugin or PTGui": "^# (?:hugin|ptGui) project file", "Pix4D": r"\APix4D", "RealityCapture": r"\bxcr:",

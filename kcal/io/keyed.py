@@ -26,16 +26,21 @@ _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _COUNTED = ("d0", "d1", "d2", "d3", "d4")
 _COEFS = "(?:coef+s?|coef+icients?|param(?:eter)?s?|vec(?:tor)?)"
 _IMAGE = "(?:image|img|frame|gray)?"
+_MATRIX = "(?:intrinsics?)?(?:matrix|mtx|mat)"
+_LENS, _DEVIATIONS = f"(?:lens)?dist(?:ort|ortion)?s?{_COEFS}?", "std(?:ard)?dev(?:iation)?s?"
 # Names and how many numbers belong to them; -1 for a text or a switch.
 _ROLES: dict[str, tuple[str, Sequence[int]]] = {
-    "matrix": ("(?:intrinsics?)?(?:matrix|mtx|mat)|intrinsics?(?:param(?:eter)?s?)?|kk?|m|cm|a", (4, 9)),
-    "lens": (f"(?:lens)?dist(?:ort|ortion)?s?{_COEFS}?|coef+(?:icient)?s?|d|kc", range(15)),
+    "matrix": (f"{_MATRIX}|intrinsics?(?:param(?:eter)?s?)?|kk?|m|cm|a", (4, 9)),
+    "lens": (f"{_LENS}|coef+(?:icient)?s?|d|kc", range(15)),
     "width": (f"{_IMAGE}(?:width|w)|imagecols", (1,)),
     "height": (f"{_IMAGE}(?:height|h)|imagerows", (1,)),
     "size": (f"{_IMAGE}(?:size|resolution|dims?|dimensions?)", (2,)),
     "kind": ("(?:lens|distortion|dist|projection|calib(?:ration)?|opencv)?(?:model|type|modeltype|modelname)", (-1,)),
     "fisheye": ("(?:is|use)?fisheye(?:model)?", (-1, 1)),
-    "sigmas": ("std(?:ard)?dev(?:iation)?s?(?:intrinsics)?", range(4, 19)),
+    "sigmas": (f"{_DEVIATIONS}(?:intrinsics)?", range(4, 19)),
+    # As OpenCV's interactive calibration has them.
+    "matrix_sigmas": (f"{_MATRIX}{_DEVIATIONS}", (4,)),
+    "lens_sigmas": (f"{_LENS}{_DEVIATIONS}", range(4, 15)),
     "rotation": ("(?:stereo)?(?:r|rot(?:ation)?(?:matrix|mat|vector|vec)?|rmat)", (3, 9)),
     "translation": ("(?:stereo)?(?:t|trans(?:lation)?(?:vector|vec)?|tvec)", (3,)),
     # ORB-SLAM3's first camera from the second, OKVIS's body from a camera, and MC-Calib's first camera from one.
@@ -50,7 +55,7 @@ _ROLES: dict[str, tuple[str, Sequence[int]]] = {
     "center": ("cc|pp|center|principalpoint", (2,)),
     "cx": ("cx|cu|u0|ppx|(?:principal(?:point)?|center)x", (1,)),
     "cy": ("cy|cv|v0|ppy|(?:principal(?:point)?|center)y", (1,)),
-    **{name: (name, (1,)) for name in ("xi", "skew", *_COEFFICIENTS, *_COUNTED)},
+    **{name: (name, (1,)) for name in ("xi", "alpha", "skew", *_COEFFICIENTS, *_COUNTED)},
 }
 _PATTERNS = {role: re.compile(f"(?:cam(?:era)?)?(?:{names})") for role, (names, _) in _ROLES.items()}
 _AFTER = re.compile(r"(.+?)(left|right|l|r|(?:cam(?:era)?)?[0-9]{1,3})")
@@ -326,6 +331,8 @@ def _camera(
         return _realsense_lens(fisheye, plain, foreign.numbers(lens, 5, key), notes)
     if fisheye and len(lens) > 4 and not any(lens[4:]):
         lens = lens[:4]
+    if ("xi", side) in named.at and ("alpha", side) in named.at and not any(lens):
+        return foreign_camera("ds", name, core, size, [xi, named.number("alpha", side)], notes, skew)
     if xi:
         if len(lens) != 4:
             raise ValueError(f"an omnidir camera has 4 coefficients, {key} has {len(lens)}")
@@ -348,11 +355,21 @@ def _camera(
     skew = skew or named.number("skew", side)
     model = "fisheye4" if fisheye else OPENCV_MODELS[len(lens)]
     camera = foreign.named_camera(name, core, size, model, lens or [0.0] * 4 * bool(fisheye), skew)
-    if (sigmas := named.get("sigmas")) is not None and not side:
-        # OpenCV always states those of 14 coefficients.
-        given = foreign.numbers(sigmas, (4 + len(lens), 18), named.key("sigmas", side))
-        notes.append(foreign.with_sigmas(camera, given[: 4 + len(lens)]))
+    if sigmas := _stated_sigmas(named, side, core, len(lens)):
+        notes.append(foreign.with_sigmas(camera, sigmas))
     return camera if hints.size else _delivered(named, side, camera, notes)
+
+
+def _stated_sigmas(named: _Named, side: str, core: Sequence[float], coefficients: int) -> list[float]:
+    """Standard deviations of fx, fy, cx, cy and the coefficients; none if the file has none."""
+    if not side and (whole := named.get("sigmas")) is not None:
+        # OpenCV always states those of 14 coefficients.
+        return foreign.numbers(whole, (4 + coefficients, 18), named.key("sigmas", side))[: 4 + coefficients]
+    first, rest = (foreign.flat(named.get(role, side)) or [] for role in ("matrix_sigmas", "lens_sigmas"))
+    if not first:
+        return []
+    # One focal length is stated once.
+    return [first[0] or first[1] * (core[0] == core[1]), *first[1:], *(rest or [0.0] * coefficients)]
 
 
 def _realsense_lens(kind: str, like: Camera, lens: list[float], notes: list[str]) -> Camera:

@@ -92,13 +92,13 @@ def terrain(path: str | Path, geoid_height: float | None = None) -> Raster:
     r"""Ground from a raster of heights, for example a GeoTIFF, interpolated between the middles of its cells.
 
     An ESRI ASCII grid (.asc) is read without further packages: in the coordinate system of the .prj file beside it, or
-    in degrees, if its numbers are such. Other rasters need the extra `terrain`. A raster's own scale, offset and unit of
-    heights are heeded.
+    in degrees, if its numbers are such. Other rasters need the extra `terrain`. A raster's own scale, offset and unit
+    of heights are heeded.
 
     Args:
         path: a raster with a coordinate system.
-        geoid_height: meters that are added, for a raster of heights above the sea: the height of the geoid there. Needed
-            where the coordinate system says that its heights are such.
+        geoid_height: meters that are added, for a raster of heights above the sea: the height of the geoid there.
+            Needed where the coordinate system says that its heights are such.
 
     Raises:
         InputError: rasterio is missing, or a height that is not finite; heights above the sea without `geoid_height`.
@@ -124,7 +124,7 @@ def terrain(path: str | Path, geoid_height: float | None = None) -> Raster:
     heights, to_cell, whole, unit = read(Path(path))
     if geoid_height is None and (above := [part.name for part in whole.sub_crs_list if part.is_vertical]):
         raise InputError(f"{path}: its heights are above the sea ({above[0]}): give the height of the geoid there")
-    system, heights = whole.to_2d(), heights * _meters(path, unit, whole)
+    system, heights = whole.to_2d(), heights * _unit_of_heights(path, unit, whole)
     if not all(map(math.isfinite, to_cell)):
         raise FileError(f"{path}: its cells have no size on the ground")
     if np.isinf(heights).any():
@@ -152,7 +152,7 @@ def terrain(path: str | Path, geoid_height: float | None = None) -> Raster:
     return Raster(heights, to_cell, into, min(sides))
 
 
-def _meters(path: str | Path, unit: str, system: pyproj.CRS) -> float:
+def _unit_of_heights(path: str | Path, unit: str, system: pyproj.CRS) -> float:
     """Length of the unit of a raster's heights: the one that the file names, or that of a third axis."""
     from pyproj.database import get_units_map
 
@@ -160,7 +160,7 @@ def _meters(path: str | Path, unit: str, system: pyproj.CRS) -> float:
         return system.axis_info[2].unit_conversion_factor if len(system.axis_info) == 3 else 1.0
     known = {"meter": 1.0, "feet": 0.3048}
     for one in get_units_map(category="linear").values():
-        known |= dict.fromkeys((one.name.lower(), one.proj_short_name), one.conv_factor)
+        known |= dict.fromkeys((one.name.lower(), one.proj_short_name or ""), one.conv_factor)
     name = unit.strip().lower()
     if (length := known.get(name) or known.get(name.removesuffix("s"))) is None:
         raise FileError(f"{path}: its heights are in {unit!r}, which is no known unit of length")

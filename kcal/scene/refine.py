@@ -47,6 +47,8 @@ _FAINTEST = 0.35
 _LEAST_SHARE = 0.55
 # How much longer or shorter a pixel is in the other image: below, blur is alike, and beyond, it is no patch of ground.
 _LEAST_WARPED, _MOST_WARPED = 0.05, 2.5
+# Pixels that a patch covers in an image at most: of windows that are cut out together, all are as large as the largest.
+_WIDEST = 200.0
 _AT_ONCE = 200  # a thousand take a quarter longer
 
 
@@ -85,7 +87,7 @@ def _refined_part(rig: Rig, images: tuple[Tensor, Tensor], left: Tensor, right: 
     turn = rig.right_from_left_rotation
     here, steps, seen = _patch(rig.left, planes, planes.left, None)
     there, slopes, shown = _patch(rig.right, planes, planes.right, turn)
-    valid = planes.valid & seen & shown
+    valid = planes.valid & seen & shown & (_span(here) < _WIDEST) & (_span(there) < _WIDEST)
     here = torch.where(valid[:, None, None, None], here, 0.0)
     there = torch.where(valid[:, None, None, None], there, 0.0)
     flat = there.flatten(1, 2)
@@ -116,6 +118,12 @@ def _refined_part(rig: Rig, images: tuple[Tensor, Tensor], left: Tensor, right: 
     near = torch.linalg.vector_norm(pixels[:, 0] - right, dim=-1) < _FARTHEST
     good = valid & fit.converged & inside[:, 0] & near & (worst < _FAINTEST) & (fit.share > _LEAST_SHARE)
     return RefinedMatches(pixels[:, 0], covariance, good, fit.share)
+
+
+def _span(pixels: Tensor) -> Tensor:
+    """(M,) the longer side of what patches (M, h, w, 2) cover, px."""
+    flat = pixels.flatten(1, 2)
+    return (flat.amax(1) - flat.amin(1)).amax(1)
 
 
 def _warps(left: Tensor, right: Tensor, shear: Tensor) -> Tensor:

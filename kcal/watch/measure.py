@@ -25,7 +25,7 @@ from kcal.scene.match import ImagePair, MatchedPair, match_scene
 from kcal.scene.refine import SAME, SWAY, whole_shifts
 from kcal.strict_formats import read_npz
 from kcal.watch.history import Look, between_rows, no_look
-from kcal.watch.turned import camera_turns
+from kcal.watch.marked_twice import camera_turns
 
 # What is looked for in each image of a watched rig: patches of fixed points, and where they were.
 #

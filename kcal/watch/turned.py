@@ -16,169 +16,23 @@ import kcal.calibrate.rig.adjustment as adjustment
 from kcal.calibrate.rig.marks import Features, Landmarks
 from kcal.calibrate.rig.problem import RigSolution, goodness_of_fit
 from kcal.calibrate.rig.result import records
-from kcal.calibrate.rig.source import Start, typical_ratio
+from kcal.calibrate.rig.source import Start
 from kcal.calibrate.rig.sources import RigData
 from kcal.calibrate.rig.unknowns import by_errors, held
-from kcal.checks import as_points, beyond_chance, chi2_quantile, variance_factor
+from kcal.checks import as_points, beyond_chance
 from kcal.errors import DegenerateError, InputError
 from kcal.gaussian import half_of_covariance
 from kcal.lens.calibration import ItemResidual
-from kcal.lens.camera import Camera
-from kcal.lens.pose import fit_turn, rotation_from_vector, seen_turned, vector_from_rotation
-from kcal.lens.projection import FAR
+from kcal.lens.pose import rotation_from_vector, vector_from_rotation
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig
 from kcal.locate.budget import measured_ranges, right_turned, usual_ranges
 from kcal.locate.marks import PAIR, Marks
 from kcal.locate.mounting import attitude
-from kcal.locate.stereo import sight_lines
+from kcal.locate.stereo import PositionStatus, sight_lines
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief
 from kcal.threads import in_one_thread
-
-# Find how cameras have turned, from marks of the same static points then and now.
-#
-# A camera that turns about its center moves the images of points by amounts that do not depend on their distance. So
-# each camera is solved alone, from the differences between its marks now and then. What is the same in both cancels:
-# errors of the lens and of the rig. Equal marks give exactly no turn.
-
-_ROUNDS = 30
-
-
-class CameraTurn(NamedTuple):
-    """How one camera has turned.
-
-    Attributes:
-        vector: (3,) radians about its own axes: pitch, yaw, roll.
-        covariance: (3, 3).
-        off: (F, 2) px, marks now minus where the turn puts those of then; NaN where one of the two is missing.
-        squares: (F,) χ² of these, without what a mark itself takes from the fit: two degrees of freedom; 0 where NaN.
-    """
-
-    vector: Tensor
-    covariance: Tensor
-    off: Tensor
-    squares: Tensor
-
-
-class CameraTurns(NamedTuple):
-    """How cameras have turned, by features that stand still.
-
-    Attributes:
-        each: camera's turn; covariances are multiplied by the variance.
-        used: (F,) features that have not moved.
-        over_limit: (F,) χ² of each in the camera where it fits worst, over the largest that noise explains.
-        variance: how many times larger the squares of residuals are than the sigma of the marks says, at least 1.
-    """
-
-    each: list[CameraTurn]
-    used: Tensor
-    over_limit: Tensor
-    variance: float
-
-
-def camera_turns(
-    cameras: Sequence[Camera], names: Sequence[str], then: Tensor, now: Tensor, sigma: Tensor | float
-) -> CameraTurns:
-    """Find how each camera has turned; features that moved are left out.
-
-    Args:
-        cameras: C cameras.
-        names: of the cameras.
-        then: (F, C, 2) marks in all cameras; NaN where there is none.
-        now: (F, C, 2) likewise.
-        sigma: of the difference between two marks along an axis, px; one number, or (F, C).
-
-    Raises:
-        InputError: many features moved.
-        DegenerateError: a camera has fewer than two features with marks then and now, or all in one place.
-    """
-    sigmas = torch.as_tensor(sigma, dtype=torch.float64).expand(then.shape[:2]).nan_to_num(1.0)
-    views = [_MarksTwice(camera, then[:, c], now[:, c], sigmas[:, c, None]) for c, camera in enumerate(cameras)]
-    known = torch.stack([view.known for view in views])
-    for name, marked in zip(names, known, strict=True):
-        if int(marked.sum()) < 2:
-            raise DegenerateError(
-                f"drift: two features or landmarks at least are needed; {name} has {int(marked.sum())} with marks "
-                "then and now. More let wrong ones be found"
-            )
-    matched = known.any(0)
-    found = [view.turn(matched, robust=True) for view in views]
-    if (times := max(math.sqrt(_typical(turn)) for turn in found)) > adjustment.WRONG_AS_A_WHOLE:
-        raise InputError(
-            f"drift: no turn explains the marks: typically they are {times:.0f} times as far off as their sigma says; "
-            "check names, the sigma of the marks and that the images are of these cameras"
-        )
-    used = torch.zeros_like(matched)
-    limit = chi2_quantile(2.0, 1.0 - adjustment.FALSE_ALARM / int(known.sum()))
-    for _ in range(_ROUNDS):
-        # What is typical of a camera counts as its noise.
-        over = torch.stack([turn.squares / (max(1.0, _typical(turn)) * limit) for turn in found]).amax(0)
-        before, used = used, matched & (over <= 1.0)
-        if torch.equal(before, used):
-            break
-        gone, total = int((matched & ~used).sum()), int(matched.sum())
-        if gone > max(1, adjustment.MOST_WRONG * total):
-            raise InputError(
-                f"{gone} of {total} features have moved against the rest: these are not a few; check names, the sigma "
-                "of the marks and that the images are of these cameras"
-            )
-        found = [view.turn(used) for view in views]
-    each = zip(found, views, strict=True)
-    chi2 = sum(float((turn.off / view.sigma)[used].nan_to_num().square().sum()) for turn, view in each)
-    freedom = 2 * int((known & used).sum()) - 3 * len(cameras)
-    variance = variance_factor(chi2, freedom)
-    return CameraTurns([turn._replace(covariance=variance * turn.covariance) for turn in found], used, over, variance)
-
-
-class _MarksTwice:
-    """Marks in one camera then and now, (F, 2), and the sigma (F, 1) of their difference along an axis."""
-
-    def __init__(self, camera: Camera, then: Tensor, now: Tensor, sigma: Tensor) -> None:
-        self.camera, self.sigma = camera, sigma
-        rays, valid = camera.unproject(then)
-        self.known = valid & torch.isfinite(now).all(-1)
-        self.points = FAR * rays
-        # The marks of then as they come back from their rays: equal marks leave no rounding.
-        self.moved = now - then + self._project(torch.eye(3, dtype=torch.float64))[0]
-
-    def _project(self, rotation: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (F, 2) of the points after a turn, and their derivatives (F, 2, 3) by a further one."""
-        pixels, rows = seen_turned(self.camera, self.points, rotation)
-        return pixels.T, rows[:3].permute(2, 1, 0)
-
-    def turn(self, used: Tensor, *, robust: bool = False) -> CameraTurn:
-        """The turn that takes the marks of then to those of now."""
-        used, sigma = used & self.known, self.sigma
-
-        def weighted(rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            pixels, rows = self._project(rotation)
-            scaled = torch.where(self.known[:, None], self.moved - pixels, torch.nan) / sigma
-            loss = adjustment.LOSS.weight(0.5 * scaled.square().sum(-1)) if robust else torch.ones_like(scaled[:, 0])
-            return torch.where(used, loss.sqrt(), 0.0), rows / sigma[..., None], scaled
-
-        def look(rotation: Tensor, _: Tensor) -> tuple[Tensor, Tensor]:
-            root, rows, scaled = weighted(rotation)
-            return (root[:, None, None] * rows).flatten(0, 1), -(root[:, None] * scaled).flatten()
-
-        turn = fit_turn(torch.eye(3, dtype=torch.float64), look, settled=1e-12).rotation
-        root, rows, scaled = weighted(turn)
-        seen = root[:, None, None] * rows
-        information = torch.einsum("nik,nil->kl", seen, seen)
-        values = torch.linalg.eigvalsh(information)
-        if not bool(values[0] > 1e-12 * values[2]):
-            raise DegenerateError("drift: marks in one place do not determine how a camera has turned; add others")
-        covariance = torch.linalg.inv(information)
-        # What a mark takes from the fit makes its residual smaller; one that was left out has the fit's error on top.
-        share = torch.zeros_like(covariance[:2, :2]) if robust else rows @ covariance @ rows.mT
-        spread = torch.eye(2, dtype=torch.float64) + torch.where(used[:, None, None], -share, share)
-        squares = torch.einsum("ni,nij,nj->n", scaled, torch.linalg.pinv(spread, rtol=1e-6, hermitian=True), scaled)
-        return CameraTurn(vector_from_rotation(turn), covariance, sigma * scaled, squares.nan_to_num())
-
-
-def _typical(turn: CameraTurn) -> float:
-    """How much larger χ² typically is than the sigma of the marks says."""
-    return typical_ratio(turn.squares, 2.0 * torch.isfinite(turn.off).all(-1))
-
+from kcal.watch.marked_twice import camera_turns, moved_cameras
 
 # Measure how the cameras of a rig have turned since it was solved, from points that do not move (`kcal rig check`).
 #
@@ -211,6 +65,7 @@ class Drift:
         cam_from_local: (3, 3) of the left camera now, where a pose was given.
         items: residuals by item, those left out included: what moved, or is not the same point.
         variance: by which covariances were multiplied, because residuals were larger than stated.
+        moved: what near points tell of cameras that are elsewhere now, a sentence each: their turns are wrong then.
     """
 
     __repr__ = brief
@@ -230,6 +85,7 @@ class Drift:
     cam_from_local: Tensor | None
     items: tuple[ItemResidual, ...]
     variance: float
+    moved: tuple[str, ...] = ()
 
     @property
     def significant(self) -> bool:
@@ -301,12 +157,17 @@ class Drift:
         Args:
             note: when and from what, for the record.
 
+        Raises:
+            InputError: a camera has moved.
+
         Example:
             >>> from kcal.rig import planned_rig
             >>> turned = drift_of_turns(planned_rig(), 1e-4 * torch.ones(6).double(), 1e-10 * torch.eye(6).double())
             >>> float(turned.relocked("Monday").baseline)
             10.0
         """
+        if self.moved:
+            raise InputError(f"{' and '.join(self.moved)}: turns alone do not correct the rig; solve it anew")
         rig = self.old
         new = Rig.pair(rig.left, rig.right, self.rig.right_from_left_rotation, self.rig.right_from_left_translation)
         stands, pad = rig.mounting, torch.nn.functional.pad
@@ -517,9 +378,15 @@ def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift
             source="features", name=feature, pixels=tuple(off.get(name) for name in PAIR), sigmas=typical,
             over_limit=over, used=used, reason="" if used else reason,
         ))  # fmt: skip
+    # Roughly how far away points are, from the marks of then.
+    lines = sight_lines(rig, *then.unbind(1))
+    apart = torch.stack([lines.points, rig.right_from_left(lines.points)], 1).norm(dim=-1)
+    inverse = torch.where((lines.status == int(PositionStatus.OK))[:, None], apart.reciprocal(), 0.0)
+    slid = moved_cameras((rig.left, rig.right), PAIR, then, now, sigma, inverse)
     turns = torch.cat([turn.vector for turn in found.each])
     covariance = torch.block_diag(*(turn.covariance for turn in found.each))
-    return drift_of_turns(rig, turns, covariance, cam_from_local, items=tuple(items), variance=found.variance)
+    drift = drift_of_turns(rig, turns, covariance, cam_from_local, items=tuple(items), variance=found.variance)
+    return dataclasses.replace(drift, moved=slid)
 
 
 def drift_of_turns(

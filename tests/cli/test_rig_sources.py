@@ -109,6 +109,22 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 SOLVE = "rig left.json right.json --landmarks survey.csv --marks marks.csv --pixel-sigma 0.1"
 
 
+def test_two_cameras_by_the_names_of_their_files(site: Path, command: Command) -> None:
+    """Measured positions, as marks; a table for `locate` names left and right."""
+    for old, new in (("left", "mill"), ("right", "mast")):
+        (site / f"{new}.camera.json").write_bytes((site / f"{old}.json").read_bytes())
+    text = (site / "gnss.csv").read_text()
+    (site / "named.csv").write_text(text.replace("left,", "mill,").replace("right,", "mast,"))
+    solve = "rig mill.camera.json mast.camera.json --landmarks survey.csv --marks marks.csv --pixel-sigma 0.1"
+    found = [command(solve, f"--positions {name}.csv -o {name}.json").out for name in ("gnss", "named")]
+    assert [line for line in found[0].splitlines() if "baseline" in line] == [
+        line for line in found[1].splitlines() if "baseline" in line
+    ]
+    (site / "long.csv").write_text("name,camera,u,v\nt0,mill,500,500\nt0,mast,480,500\n")
+    said = command("locate named.json long.csv", code=1).err.replace("\n", " ")
+    assert "they are left, right, in the order in which the rig was solved" in said
+
+
 def test_from_survey_to_positions(site: Path, command: Command) -> None:
     more = "--features far.csv --positions gnss.csv --baseline 9.97+-0.05 --picture rig.png"
     printed = command(SOLVE, more, "-o rig.json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -441,6 +442,22 @@ def test_what_is_missing_of_a_pose_is_asked_for(words: str, message: str, known:
     Path("bare.csv").write_text(POSES.replace("5,0.05,2", "5,,2"))
     assert message in command(f"place west.camera.json {words} -o rig.json", code=1).err.replace("\n", " ")
     assert not Path("rig.json").exists()
+
+
+def test_the_budget_of_a_pair_whose_poses_are_known(known: Path, command: Command) -> None:
+    """10 m apart, both looking to 62°: as that of the planned rig, whose frame is the left camera's."""
+    east, north = 10.0 * math.cos(math.radians(62)), -10.0 * math.sin(math.radians(62))
+    ends = ",5,10,62,0.1,0,0.05,0,0.05"
+    place = enu_to_geodetic(
+        torch.tensor([east, north, 0.0]).double(), Origin(lat=46.0, lon=7.0, height=1500.0)
+    ).tolist()
+    rows = [f"left,46.0,7.0,1500{ends}", f"right,{place[0]!r},{place[1]!r},{place[2]!r}{ends}"]
+    Path("poses.csv").write_text("\n".join([POSES.splitlines()[0], *rows]) + "\n")
+    command("place left.camera.json right.camera.json --places poses.csv -o rig.json")
+    placed = command("budget rig.json --distances 1000,5000 --pixel-sigma 0.3").out
+    planned = command("budget --focal 1600 --baseline 10 --distances 1000,5000 --pixel-sigma 0.3").out
+    told = [[line for line in text.splitlines() if "disparity" in line][-2:] for text in (placed, planned)]
+    assert told[0] == told[1]
 
 
 def test_one_camera_in_place_of_a_rig_is_told_of_known_poses(known: Path, command: Command) -> None:

@@ -20,6 +20,7 @@ from command_line import Command
 from PIL import Image
 
 from kcal.errors import FileError
+from kcal.io.foreign_lenses import ForeignCamera
 from kcal.io.formats import import_cameras, recognized
 from kcal.lens.camera import Camera
 
@@ -543,10 +544,35 @@ class TestEchoed:
         assert off(seen(found.cameras[0]), opencv(K, D)) < 1e-9
 
 
+@pytest.mark.parametrize("names", [("camera_matrix", "distortion_coefficients"), ("cameraMatrix", "dist_coeffs")])
+def test_error_bars_of_opencvs_interactive_calibration(tmp_path: Path, names: tuple[str, str]) -> None:
+    """One focal length is stated once: the other one's is 0."""
+    matrix, lens = names
+    content = {"cameraResolution": [1280, 720], matrix: plain(905.5, 905.5, 654.3, 398.5),
+               f"{matrix}_std_dev": [0.0, 6.2, 1.9, 1.7], lens: [0.0, -0.1, 0.0, 0.0, 0.06],
+               f"{lens}_std_dev": [0.0, 0.013, 0.0, 0.0, 0.027]}  # fmt: skip
+    (camera,) = import_cameras(written(tmp_path, "c.json", content)).cameras
+    assert camera.calibration is not None
+    sigma = camera.calibration.sigma
+    assert [sigma[name] for name in ("fx", "fy", "cx", "cy")] == [6.2, 6.2, 1.9, 1.7]
+    assert [sigma[name] for name in ("k1", "k2", "k3")] == [None, 0.013, 0.027]
+
+
+def test_xi_and_alpha_are_a_double_sphere(tmp_path: Path) -> None:
+    own = {"fx": 340.0, "fy": 341.0, "cx": 640.0, "cy": 480.0, "alpha": 0.558, "Xi": -3.5e-3}
+    found = import_cameras(written(tmp_path, "c.json", {"resolution": [1280, 960], "params_ds": own}))
+    assert "its ds lens" in found.notes[0]
+    camera = found.cameras[0]
+    truth = ForeignCamera("ds", (340.0, 341.0, 640.0, 480.0, 0.0, -3.5e-3, 0.558), (1280, 960), "")
+    rays, valid = camera.unproject(camera.grid(9, 7).reshape(-1, 2))
+    assert float((truth.project(rays[valid])[0] - camera.grid(9, 7).reshape(-1, 2)[valid]).abs().max()) < 0.05
+
+
 @pytest.mark.parametrize(
     ("name", "content", "program"),
     [
         ("a.json", {"views": [], "intrinsics": []}, "Meshroom"),
+        ("a.json", {"sfm_data_version": "0.3", "views": [], "intrinsics": []}, "OpenMVG"),
         ("calib_results.txt", "#polynomial coefficients for the DIRECT mapping function.\n5\n", "OCamCalib"),
         ("bundle.out", "# Bundle file v0.3\n1 2\n", "Bundler"),
         ("a.nvm", "NVM_V3\n\n2\n", "VisualSFM"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import torch
 
 from kcal import Camera
 from kcal.errors import FileError, InputError
-from kcal.io.foreign_lenses import ForeignCamera, fit_foreign
+from kcal.io.foreign_lenses import ForeignCamera, fit_foreign, foreign_camera
 from kcal.lens import export_cameras, import_cameras
 from scripts.check.foreign_lenses import (
     CX,
@@ -103,6 +104,21 @@ def test_a_lens_is_found_again(kind: str) -> None:
     stand_in = Shown(WIDE.params, size=SIZE, model=WIDE.model)
     found = fit_foreign(kind, stand_in)
     assert float((found.project(rays)[0] - pixels).norm(dim=-1).max()) < 1e-3
+
+
+@pytest.mark.parametrize("own", [(-0.2, 0.59), (0.183, 0.809)])
+def test_pixels_that_have_no_ray_get_none(own: tuple[float, float]) -> None:
+    """A double sphere ends at r² = 1 / (2 alpha - 1) (Usenko et al. 2018, Eq. 45), here inside the image."""
+    notes: list[str] = []
+    camera = foreign_camera("ds", "c", (300.0, 300.0, 639.5, 479.5), (1280, 960), own, notes)
+    pixels = camera.grid(97, 73).reshape(-1, 2)
+    _, valid = camera.unproject(pixels)
+    square = ((pixels - torch.tensor([639.5, 479.5])) / 300.0).square().sum(-1) * (2.0 * own[1] - 1.0)
+    assert not bool(valid[square > 1.0].any())
+    assert bool(valid[square < 0.95].all())
+    share = float((~valid).double().mean())
+    assert 0.03 < share < 0.7
+    assert float(re.findall(r"([0-9.]+)% of the image has no ray", notes[0])[0]) == pytest.approx(100 * share, abs=1.0)
 
 
 @pytest.mark.parametrize(("form", "model"), OUT)

@@ -170,6 +170,42 @@ def test_heights_are_interpolated_between_the_centers_of_cells(tmp_path: Path) -
     assert found[3:].isnan().all()
 
 
+@pytest.mark.parametrize(
+    ("scale", "offset", "unit", "crs", "meters"),
+    [
+        (0.1, 0.0, None, "EPSG:4326", 0.1), (1.0, 3.0, "metre", "EPSG:4326", 1.0),
+        (1.0, 0.0, "feet", "EPSG:4326", 0.3048), (1.0, 0.0, "US survey foot", "EPSG:4326", 1200 / 3937),
+        (1.0, 0.0, "", "EPSG:4326+8228", 0.3048), (1.0, 0.0, "m", "EPSG:4326+5703", 1.0),
+    ],
+)  # fmt: skip
+def test_scale_offset_and_unit_of_a_raster(
+    scale: float, offset: float, unit: str | None, crs: str, meters: float, tmp_path: Path
+) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    path = tmp_path / "four.tif"
+    transform = rasterio.transform.from_origin(72.0, 19.0, 0.1, 0.1)
+    system = pyproj.CRS(crs).to_wkt()
+    with rasterio.open(path, "w", driver="GTiff", height=2, width=2, count=1, dtype="int16", crs=system,
+                       transform=transform) as file:  # fmt: skip
+        file.write(np.array([[100, 200], [300, 400]], dtype=np.int16), 1)
+        file.scales, file.offsets = (scale,), (offset,)
+        if unit is not None:
+            file.units = (unit,)
+    place = torch.tensor([[18.9], [72.1]], dtype=torch.float64)
+    if "+" in crs:
+        with pytest.raises(InputError, match=r"above the sea \(NAVD88 height.*\): give the height of the geoid"):
+            terrain(path)
+    assert terrain(path, 7.0)(*place).tolist() == pytest.approx([7.0 + (offset + 250.0) * meters])
+
+
+def test_heights_in_no_unit_of_length_are_refused(tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    with rasterio.open(raster_file(tmp_path), "r+") as file:
+        file.units = ("kelvin",)
+    with pytest.raises(FileError, match="in 'kelvin', which is no known unit of length"):
+        terrain(tmp_path / "terrain.tif")
+
+
 def test_a_flat_line_of_sight_is_a_bearing_only() -> None:
     level = stands(pitch_deg=0.0, roll_deg=0.0)
     grazing = torch.tensor([[960.0, 549.0], [5000.0, 700.0], [math.nan, 0.0]]).double()

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from kcal import Camera, InputError, Rig
 from kcal.corners.match import Keypoints
+from kcal.corners.patches import ImageWindows
 from kcal.scene import refine
 from kcal.scene.match import ImagePair, _both_ways, guided_matches, match_scene
 from tests.helpers.scene_pairs import small_rig
@@ -104,6 +105,31 @@ def test_a_patch_that_is_not_seen_is_no_match(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(refine, "object_planes", without_one)
     monkeypatch.setattr(refine, "_patch", without_parts)
     assert refine.refine_matches(LEVEL, images, left, right).good.tolist() == [False, False, False, True]
+
+
+def test_a_patch_that_runs_away_takes_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All windows are as large as the largest; one that spans two thousand pixels would ask for gigabytes."""
+    picture, patch = 255.0 * torch.rand(321, 481, generator=torch.Generator().manual_seed(1)), refine._patch
+    left = torch.tensor([[150.0, 100.0], [220.0, 120.0], [300.0, 160.0]]).double()
+
+    def away(camera: Camera, *others: object) -> tuple[Tensor, Tensor, Tensor]:
+        pixels, slopes, whole = patch(camera, *others)  # type: ignore[arg-type]
+        pixels[0, 0, 0] += 2000.0
+        return pixels, slopes, whole
+
+    widest = []
+    windows = refine.image_windows
+
+    def cut(image: Tensor, pixels: Tensor, *others: float) -> ImageWindows:
+        widest.append(float((pixels.flatten(1, -2).amax(1) - pixels.flatten(1, -2).amin(1)).max()))
+        return windows(image, pixels, *others)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(refine, "_patch", away)
+    monkeypatch.setattr(refine, "image_windows", cut)
+    images = picture, torch.roll(picture, -3, 1)
+    found = refine.refine_matches(LEVEL, images, left, left - torch.tensor([3.0, 0.0]).double())
+    assert not bool(found.good[0])
+    assert max(widest) < 400.0
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

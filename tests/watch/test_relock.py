@@ -202,6 +202,20 @@ def test_sigma_of_a_drift_is_what_each_of_its_turns_does() -> None:
     torch.testing.assert_close(effect.sigma, squares.sqrt(), rtol=1e-3, atol=0)
 
 
+@pytest.mark.parametrize("degrees", [-0.06, 0.05])
+def test_sigma_of_a_drift_is_that_of_the_range_that_is_found(degrees: float) -> None:
+    """Four times as far, or half as far: 1 / range changes alike."""
+    rig, yaw = pinhole_rig(1600.0, 10.0), torch.diag(tensor(0.0, 1e-7, 0.0) ** 2)
+
+    def turned(radians: float) -> DriftEffect:
+        turn = rotation_from_vector(tensor(0.0, radians, 0.0))
+        new = Rig.pair(rig.left, rig.right, turn @ rig.right_from_left_rotation, turn @ rig.right_from_left_translation)
+        return effect_of(rig, new, yaw, (5000.0,))
+
+    effect, more = (turned(math.radians(degrees) + extra) for extra in (0.0, 1e-7))
+    assert effect.sigma.item() == pytest.approx(abs(float(more.found - effect.found)), rel=1e-3)
+
+
 def test_sigma_of_a_drift_by_the_disparity() -> None:
     """A yaw of ω shifts a range Z by Z² ω / b."""
     rig = pinhole_rig(1600.0, 10.0)

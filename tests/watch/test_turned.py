@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from locate_rigs import pinhole_rig
 from rig_scenes import CAMERAS, CENTER, ROTATION, landmarks, normal, spread_points, tensor
 from torch import Tensor
 
@@ -278,3 +279,36 @@ class TestRefusals:
         features.pixels[2, :2] = math.nan
         (item,) = measure_drift(RIG, features=features).left_out
         assert (item.name, item.reason) == ("s2", "no camera has a mark of it both then and now")
+
+
+def seen_later(seed: int, shift: float, gone: int = 0) -> Features:
+    """40 points 50 to 2000 m away, the right camera shifted to its right and turned; some points moved by a meter."""
+    draw = torch.Generator().manual_seed(seed)
+    uniform, noise = torch.rand(3, 40, generator=draw).double(), torch.randn(40, 4, 2, generator=draw).double()
+    rig, far = pinhole_rig(1600.0, 10.0), 50.0 * 40.0 ** uniform[0]
+    points = torch.stack([(uniform[1] - 0.4) * far, 0.5 * (uniform[2] - 0.5) * far, far], -1)
+    turn = rotation_from_vector(tensor(1e-4, -2e-4, 3e-4))
+    later = Rig.pair(rig.left, rig.right, turn, turn @ (rig.right_from_left_translation - tensor(shift, 0.0, 0.0)))
+    now = points.clone()
+    now[:gone] += 1.0
+    pixels = torch.stack([*rig(points)[0].unbind(-2), *later(now)[0].unbind(-2)], 1) + 0.2 * noise
+    unknown = torch.zeros(40).double(), torch.full((40,), math.inf).double()
+    return Features(names=tuple(map(str, range(40))), pixels=pixels, inverse_range=unknown[0],
+                    inverse_range_sigma=unknown[1], pixel_sigma=0.2)  # fmt: skip
+
+
+def test_a_camera_that_slid_is_no_camera_that_turned() -> None:
+    """Near points move more than far ones: 10 cm are told, and do not become a turn of the rig."""
+    drift = measure_drift(pinhole_rig(1600.0, 10.0), features=seen_later(1, 0.1))
+    (said,) = drift.moved
+    assert "the right camera has moved by some " in said
+    assert 80.0 < float(said.split()[-2]) < 120.0
+    assert said.endswith(" mm")
+    with pytest.raises(InputError, match="turns alone do not correct the rig"):
+        drift.relocked("Monday")
+
+
+@pytest.mark.parametrize("gone", [0, 5])
+def test_turns_and_points_that_moved_are_no_shift(gone: int) -> None:
+    for seed in range(6):
+        assert measure_drift(pinhole_rig(1600.0, 10.0), features=seen_later(seed, 0.0, gone)).moved == ()

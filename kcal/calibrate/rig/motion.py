@@ -214,8 +214,8 @@ class RigRows:
     def told(self, camera: int, white: Tensor) -> tuple[ViewData, PriorFamilies]:
         """Evidence of the good boards on their motions before a camera, with poses and shared unknowns integrated out.
 
-        Shared unknowns enter as combinations that are independent and of unit weight where all boards stand still: those
-        that the boards' poses or the camera feel. Most others are of other cameras.
+        Shared unknowns enter as combinations that are independent and of unit weight where all boards stand still:
+        those that the boards' poses or the camera feel. Most others are of other cameras.
 
         Args:
             camera: its number.
