@@ -176,10 +176,12 @@ class _MarksTwice:
                 squares = (scaled - slopes[..., :count] @ found).square().sum(-1)
                 weight = adjustment.LOSS.weight(0.5 * squares).sqrt()[:, None]
             costs.append(2.0 * adjustment.LOSS.value(0.5 * squares))
-        near = (slopes[..., 3:] @ found[3:]).norm(dim=-1) > _NEAR_SIGMAS
-        agree = near & (squares < chi2_quantile(2.0, 1.0 - adjustment.FALSE_ALARM))
+        # What is typical counts as noise.
+        noise = max(1.0, typical_ratio(squares, torch.full_like(squares, 2.0)))
+        near = (slopes[..., 3:] @ found[3:]).norm(dim=-1) > _NEAR_SIGMAS * math.sqrt(noise)
+        agree = near & (squares < noise * chi2_quantile(2.0, 1.0 - adjustment.FALSE_ALARM))
         # Without the point that tells most, which may be one that moved itself.
-        gain = costs[0] - costs[1]
+        gain = (costs[0] - costs[1]) / noise
         certain = len(gain) > _FEWEST_NEAR and beyond_chance(float(gain.sum() - gain.max()), 3)
         enough = int(agree.sum()) >= max(_FEWEST_NEAR, _AGREE * int(near.sum()))
         return found[3:] if certain and enough else None

@@ -108,7 +108,7 @@ def rig(repeats: int = 5) -> Lines:
     both = (calibrate_camera(left, five).camera, calibrate_camera(right, five).camera)
     pairs = pair_by_name(left.names, right.names)
     for word, refine in (("fixed", False), ("refined jointly", True)):
-        options = RigOptions(intrinsics="free" if refine else "fixed", reject=False)
+        options = RigOptions(intrinsics="free" if refine else "fixed", reject=False, weighted=False, motion=False)
         ours, theirs, spent = _in_turn(
             partial(calibrate_rig, *both, left, right, pairs, options),
             partial(_opencv_stereo, left, right, both, refine),

@@ -308,7 +308,9 @@ def test_a_camera_that_slid_is_no_camera_that_turned() -> None:
         drift.relocked("Monday")
 
 
-@pytest.mark.parametrize("gone", [0, 5])
-def test_turns_and_points_that_moved_are_no_shift(gone: int) -> None:
-    for seed in range(6):
-        assert measure_drift(pinhole_rig(1600.0, 10.0), features=seen_later(seed, 0.0, gone)).moved == ()
+@pytest.mark.parametrize(("gone", "stated"), [(0, 0.2), (5, 0.2), (0, 0.07)])
+def test_turns_points_that_moved_and_noise_are_no_shift(gone: int, stated: float) -> None:
+    """Marks may be noisier than stated."""
+    for seed in range(8):
+        marks = dataclasses.replace(seen_later(seed, 0.0, gone), pixel_sigma=stated)
+        assert measure_drift(pinhole_rig(1600.0, 10.0), features=marks).moved == ()
