@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ from kcal.strict_json import MOST_BYTES
 # (u, v, weight) of a corner; NaN where it was not seen.
 Corner = tuple[float, float, float]
 _UNSEEN = (math.nan, math.nan, math.nan)
+# Of how much rows of corners bend, squared: those of columns that are taken for rows bend a hundred times as much.
+_STRAIGHTER = 0.05
 
 
 def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] | None = None) -> Observations:
@@ -94,9 +96,24 @@ def import_corners(path: str | Path, board: Board, image_size: tuple[int, int] |
         ]
         if not found:
             raise FileError(f"{path}: no view with corners")
+        _refuse_exchanged(board, [array[:, :2] for array in shown.values()])
         return Observations(board=board, image_size=size, refinement="none", views=tuple(found))
     except InputError as error:
         raise FileError(f"{path}: bad corners file: {error}") from error
+
+
+def _refuse_exchanged(board: Board, views: Sequence[np.ndarray]) -> None:
+    """Refuse corners whose rows are as long as the board's columns: where they go straight on, unlike the board's."""
+    if board.pattern != "checkerboard" or board.columns == board.rows or min(board.columns, board.rows) < 3:
+        return
+    bends = [[np.square(np.diff(view.reshape(-1, length, 2), 2, axis=1)).sum(-1) for view in views]
+             for length in (board.columns, board.rows)]  # fmt: skip
+    own, exchanged = (np.median([np.nanmean(one) for one in each if np.isfinite(one).any()] or [0.0]) for each in bends)
+    if exchanged < _STRAIGHTER * own:
+        raise InputError(
+            f"corners are in rows of {board.rows}, not of {board.columns}: the board seems to be "
+            f"{board.rows}x{board.columns}"
+        )
 
 
 def _corner_of_weight(u: str, v: str, weight: float, where: str) -> Corner:

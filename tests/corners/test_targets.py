@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from math import nan
 from pathlib import Path
@@ -348,6 +349,21 @@ def test_bad_files(tmp_path: Path, name: str, text: str, what: str) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(FileError, match=what):
         import_corners(tmp_path / name, BOARD, SIZE)
+
+
+def test_columns_and_rows_that_are_exchanged_are_named(tmp_path: Path) -> None:
+    """Six corners in a row, seen askew; some were not found."""
+    column, row = np.meshgrid(np.arange(6), np.arange(8))
+    lines = ["image,corner,u,v"]
+    for view, (turn, depth) in enumerate(((0.2, 0.02), (1.4, 0.0), (-0.7, 0.03))):
+        across = math.cos(turn) * column - math.sin(turn) * row
+        down = math.sin(turn) * column + math.cos(turn) * row
+        u, v = (300.0 + 20.0 * side / (1.0 + depth * down) for side in (across, down))
+        lines += [f"a{view},{i},{a:.3f},{b:.3f}" for i, (a, b) in enumerate(zip(u.flat, v.flat, strict=True)) if i != 9]
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    with pytest.raises(FileError, match=r"corners are in rows of 6, not of 8: the board seems to be 6x8"):
+        import_corners(tmp_path / "a.csv", Board(columns=8, rows=6, square=0.025), SIZE)
+    assert len(import_corners(tmp_path / "a.csv", Board(columns=6, rows=8, square=0.025), SIZE).views) == 3
 
 
 def test_what_is_not_in_the_file(tmp_path: Path) -> None:
