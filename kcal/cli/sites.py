@@ -190,11 +190,6 @@ def budget_command(
     """
     chosen = kcal.rig.planned_rig(focal_px=focal, baseline_m=baseline.value) if rig is None else rooms.load_pair(rig)
     noise = pixel_sigma_of(pixel_sigma, None if rig is None else chosen)
-    if not chosen.is_pair:
-        # Directions are those of the left camera.
-        relative = chosen.right_from_left_rotation, chosen.right_from_left_translation
-        chosen, known = kcal.Rig.pair(chosen.left, chosen.right, *relative), chosen.covariance
-        chosen.covariance = known
     disparity = math.sqrt(2.0) * noise
     error = 0.001 if baseline.sigma is None else baseline.sigma
     errors = kcal.locate.BudgetErrors(

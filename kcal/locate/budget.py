@@ -114,7 +114,7 @@ def range_errors(
         >>> [round(float(value[0])) for value in found]
         [-1923, 8333, 3125]
     """
-    errors = errors or BudgetErrors()
+    errors, rig = errors or BudgetErrors(), in_left_frame(rig)
     far, points, left, right = points_at(rig, distances, pixel)
     ray = points[0] / far[0]
     with torch.no_grad():
@@ -188,6 +188,15 @@ def _crossing(rig: Rig, ray: Tensor) -> Tensor:
     if not float(length) > 0:
         raise InputError("the view runs along the baseline: no range can be measured there")
     return across / length
+
+
+def in_left_frame(rig: Rig) -> Rig:
+    """Two cameras in the left one's frame, with the errors of lenses and relative pose; not where that one stands."""
+    if rig.is_pair:
+        return rig
+    pair = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, rig.right_from_left_translation)
+    pair.covariance = rig.covariance
+    return pair
 
 
 def right_turned(rig: Rig, vector: Tensor) -> Rig:
@@ -281,7 +290,7 @@ def range_sigmas(
         >>> [round(float(part)) for part in (found.marks, found.lenses, found.pose, found.total)]
         [221, 0, 44, 225]
     """
-    variance = checked_rig(rig, pixel_sigma) ** 2
+    variance, rig = checked_rig(rig, pixel_sigma) ** 2, in_left_frame(rig)
     far, points, left, right = points_at(rig, usual_ranges(rig) if distances is None else distances, pixel)
     with torch.no_grad():
         found = fit_pairs(rig, left, right, by_camera=rig.covariance is not None)

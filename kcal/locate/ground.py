@@ -123,13 +123,17 @@ def terrain(path: str | Path, geoid_height: float | None = None) -> Raster:
     read = _read_grid if Path(path).suffix.lower() == ".asc" else _read_raster
     heights, to_cell, whole, unit = read(Path(path))
     if geoid_height is None and (above := [part.name for part in whole.sub_crs_list if part.is_vertical]):
-        raise InputError(f"{path}: its heights are above the sea ({above[0]}): give the height of the geoid there")
-    system, heights = whole.to_2d(), heights * _unit_of_heights(path, unit, whole)
+        raise InputError(
+            f"{path}: its heights are above the sea ({above[0]}): give the height of the geoid there (--geoid)"
+        )
+    system = whole.to_2d()
+    # In place: a raster may have a gigabyte.
+    heights *= _unit_of_heights(path, unit, whole)
+    heights += geoid_height or 0.0
     if not all(map(math.isfinite, to_cell)):
         raise FileError(f"{path}: its cells have no size on the ground")
     if np.isinf(heights).any():
         raise FileError(f"{path}: a height is infinite")
-    heights = heights + (geoid_height or 0.0)
     into = None
     if not (system.is_geographic and pyproj.CRS("EPSG:4326").datum == system.datum):
         into = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
@@ -179,7 +183,9 @@ def _read_raster(path: Path) -> _Read:
         with rasterio.open(path) as raster:
             _check_cells(path, raster.width, raster.height)
             heights = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
-            heights, unit = heights * raster.scales[0] + raster.offsets[0], raster.units[0] or ""
+            heights *= raster.scales[0]
+            heights += raster.offsets[0]
+            unit = raster.units[0] or ""
             if raster.transform.is_degenerate:
                 raise FileError(f"{path}: its cells have no size on the ground")
             system, to_cell = raster.crs, ~raster.transform

@@ -54,17 +54,20 @@ class CameraTurns(NamedTuple):
         used: (F,) features that have not moved.
         over_limit: (F,) χ² of each in the camera where it fits worst, over the largest that noise explains.
         variance: how many times larger the squares of residuals are than the sigma of the marks says, at least 1.
+        moved: what near points tell of cameras that are elsewhere now, a sentence each.
     """
 
     each: list[CameraTurn]
     used: Tensor
     over_limit: Tensor
     variance: float
+    moved: tuple[str, ...]
 
 
 def camera_turns(
-    cameras: Sequence[Camera], names: Sequence[str], then: Tensor, now: Tensor, sigma: Tensor | float
-) -> CameraTurns:
+    cameras: Sequence[Camera], names: Sequence[str], then: Tensor, now: Tensor, sigma: Tensor | float,
+    inverse_range: Tensor | None = None,
+) -> CameraTurns:  # fmt: skip
     """Find how each camera has turned; features that moved are left out.
 
     Args:
@@ -73,6 +76,7 @@ def camera_turns(
         then: (F, C, 2) marks in all cameras; NaN where there is none.
         now: (F, C, 2) likewise.
         sigma: of the difference between two marks along an axis, px; one number, or (F, C).
+        inverse_range: (F, C) roughly, 1 / m from each camera, 0 where it is not known; None: no camera has moved.
 
     Raises:
         InputError: many features moved.
@@ -94,6 +98,11 @@ def camera_turns(
             f"drift: no turn explains the marks: typically they are {times:.0f} times as far off as their sigma says; "
             "check names, the sigma of the marks and that the images are of these cameras"
         )
+    moved = list[str]()
+    for c, (view, turn) in enumerate(zip(views, found, strict=True)):
+        shift = None if inverse_range is None else view.shift(inverse_range[:, c].nan_to_num(0.0), turn)
+        if shift is not None:
+            moved.append(f"the {names[c]} camera has moved by some {length_text(float(shift.norm()))}")
     used = torch.zeros_like(matched)
     limit = chi2_quantile(2.0, 1.0 - adjustment.FALSE_ALARM / int(known.sum()))
     for _ in range(_ROUNDS):
@@ -113,7 +122,8 @@ def camera_turns(
     chi2 = sum(float((turn.off / view.sigma)[used].nan_to_num().square().sum()) for turn, view in each)
     freedom = 2 * int((known & used).sum()) - 3 * len(cameras)
     variance = variance_factor(chi2, freedom)
-    return CameraTurns([turn._replace(covariance=variance * turn.covariance) for turn in found], used, over, variance)
+    each_turn = [turn._replace(covariance=variance * turn.covariance) for turn in found]
+    return CameraTurns(each_turn, used, over, variance, tuple(moved))
 
 
 class _MarksTwice:
@@ -160,10 +170,12 @@ class _MarksTwice:
         squares = torch.einsum("ni,nij,nj->n", scaled, torch.linalg.pinv(spread, rtol=1e-6, hermitian=True), scaled)
         return CameraTurn(vector_from_rotation(turn), covariance, sigma * scaled, squares.nan_to_num())
 
-    def shift(self, inverse_range: Tensor) -> Tensor | None:
-        """(3,) by how much points seem shifted in the camera's frame, m; None unless that is beyond doubt."""
-        turn = rotation_from_vector(self.turn(self.known, robust=True).vector)
-        pixels, rows = seen_turned(self.camera, self.points, turn)
+    def shift(self, inverse_range: Tensor, turn: CameraTurn) -> Tensor | None:
+        """(3,) by how much points seem shifted in the camera's frame, m; None unless that is beyond doubt.
+
+        `turn` is roughly the camera's own.
+        """
+        pixels, rows = seen_turned(self.camera, self.points, rotation_from_vector(turn.vector))
         slopes = torch.cat([rows[:3], rows[3:] * FAR * inverse_range]).permute(2, 1, 0) / self.sigma[..., None]
         scaled, here = (self.moved - pixels.T) / self.sigma, self.known & slopes.isfinite().all(-1).all(-1)
         scaled, slopes, costs = scaled[here], slopes[here], list[Tensor]()
@@ -190,25 +202,3 @@ class _MarksTwice:
 def _typical(turn: CameraTurn) -> float:
     """How much larger χ² typically is than the sigma of the marks says."""
     return typical_ratio(turn.squares, 2.0 * torch.isfinite(turn.off).all(-1))
-
-
-def moved_cameras(
-    cameras: Sequence[Camera], names: Sequence[str], then: Tensor, now: Tensor, sigma: Tensor, inverse_range: Tensor
-) -> tuple[str, ...]:
-    """What near points tell of cameras that have moved, a sentence each; arguments as of `camera_turns`.
-
-    Args:
-        cameras: C cameras.
-        names: of the cameras.
-        then: (F, C, 2).
-        now: (F, C, 2).
-        sigma: (F, C).
-        inverse_range: (F, C) roughly, 1 / m from each camera; 0 where it is not known.
-    """
-    told = []
-    for c, camera in enumerate(cameras):
-        view = _MarksTwice(camera, then[:, c], now[:, c], sigma[:, c, None].nan_to_num(1.0))
-        shift = view.shift(inverse_range[:, c].nan_to_num(0.0))
-        if shift is not None:
-            told.append(f"the {names[c]} camera has moved by some {length_text(float(shift.norm()))}")
-    return tuple(told)

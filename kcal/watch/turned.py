@@ -32,7 +32,7 @@ from kcal.locate.stereo import PositionStatus, sight_lines
 from kcal.solve.lm import LMOptions
 from kcal.texts import brief
 from kcal.threads import in_one_thread
-from kcal.watch.marked_twice import camera_turns, moved_cameras
+from kcal.watch.marked_twice import camera_turns
 
 # Measure how the cameras of a rig have turned since it was solved, from points that do not move (`kcal rig check`).
 #
@@ -363,7 +363,11 @@ def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift
     """How the cameras have turned since the marks of then, with the left camera's attitude then, if it is known."""
     then, now = features.pixels.unflatten(1, (2, 2)).unbind(1)
     sigma = features.each_sigma.unflatten(1, (2, 2)).norm(dim=1)
-    found = camera_turns((rig.left, rig.right), PAIR, then, now, sigma)
+    # Roughly how far away points are, from the marks of then.
+    lines = sight_lines(rig, *then.unbind(1))
+    apart = torch.stack([lines.points, rig.right_from_left(lines.points)], 1).norm(dim=-1)
+    inverse = torch.where((lines.status == int(PositionStatus.OK))[:, None], apart.reciprocal(), 0.0)
+    found = camera_turns((rig.left, rig.right), PAIR, then, now, sigma, inverse)
     items = []
     for i, feature in enumerate(features.names):
         off = {name: float(turn.off[i].norm()) for name, turn in zip(PAIR, found.each, strict=True)}
@@ -378,15 +382,10 @@ def _since(rig: Rig, features: Features, cam_from_local: Tensor | None) -> Drift
             source="features", name=feature, pixels=tuple(off.get(name) for name in PAIR), sigmas=typical,
             over_limit=over, used=used, reason="" if used else reason,
         ))  # fmt: skip
-    # Roughly how far away points are, from the marks of then.
-    lines = sight_lines(rig, *then.unbind(1))
-    apart = torch.stack([lines.points, rig.right_from_left(lines.points)], 1).norm(dim=-1)
-    inverse = torch.where((lines.status == int(PositionStatus.OK))[:, None], apart.reciprocal(), 0.0)
-    slid = moved_cameras((rig.left, rig.right), PAIR, then, now, sigma, inverse)
     turns = torch.cat([turn.vector for turn in found.each])
     covariance = torch.block_diag(*(turn.covariance for turn in found.each))
     drift = drift_of_turns(rig, turns, covariance, cam_from_local, items=tuple(items), variance=found.variance)
-    return dataclasses.replace(drift, moved=slid)
+    return dataclasses.replace(drift, moved=found.moved)
 
 
 def drift_of_turns(
