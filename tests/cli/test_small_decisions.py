@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import shlex
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from command_line import Command
+from calibrate_scenes import corner_pixels, observe
+from command_line import Command, invoked
 from typer.testing import CliRunner, Result
 
+from kcal.cli.board import _of_each_camera
+from kcal.cli.console import print_left_out
+from kcal.cli.demo import locate_again
 from kcal.cli.demo_practice import _first
 from kcal.cli.main import app
 from kcal.cli.rig import camera_names
@@ -26,6 +33,7 @@ from kcal.lens.camera import Camera
 from kcal.lens.rig import Rig
 from kcal.report.practice_score import _meters, _signed
 
+ROOT = Path(__file__).parents[2]
 CAMERAS = [
     Camera.build(focal=(1600 + 5 * k, 1600), center=(960, 540), size=(1920, 1080), model="pinhole") for k in range(2)
 ]
@@ -159,3 +167,55 @@ class TestSources:
                               ("mill=3±1", "FIRST:SECOND=LENGTH"), ("3±1", "of 3 cameras")):  # fmt: skip
             with pytest.raises(InputError, match=message):
                 parse_baselines(text, names)
+
+
+class TestTold:
+    @pytest.mark.parametrize("count", [12, 13])
+    def test_a_list_longer_than_a_screen_goes_into_a_file(
+        self, count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setenv("COLUMNS", "500")
+        lines = [f"failed {k}.png: no board in {k} px" for k in range(count - 1)] + ["failed x.png: unreadable"]
+        print_left_out(lines, tmp_path / "left.obs.json", "images failed")
+        shown, path = capsys.readouterr().out, tmp_path / "left.left-out.txt"
+        if count == 12:
+            assert not path.exists()
+            assert shown.splitlines() == [f"  {line}" for line in lines]
+        else:
+            assert path.read_text().splitlines() == lines
+            assert shown.startswith(f"images failed, 12 of them: no board in 0 px; all of them: {path}")
+
+    def test_files_of_each_camera(self, tmp_path: Path) -> None:
+        found = [[path.name for path in _of_each_camera(tmp_path / "a.obs.json", count)] for count in (2, 3)]
+        assert found == [["a_left.obs.json", "a_right.obs.json"], [f"a_{k}.obs.json" for k in (1, 2, 3)]]
+
+    def test_the_demo_says_how_to_locate_again(self, tmp_path: Path) -> None:
+        for name, kind in (("rig", "json"), ("points", "csv")):
+            shutil.copy(ROOT / "assets" / f"sample-{name}.{kind}", tmp_path / f"{name}.{kind}")
+        words = shlex.split(locate_again(tmp_path, "--pixel-sigma", 0.4))
+        made = {path.name for path in tmp_path.iterdir()} - {"rig.json", "points.csv"}
+        assert made == {"points.geojson", "positions.csv", "map.png", "map.html"}
+        assert words[:2] == ["kcal", "locate"]
+        assert [*words[4:6], words[-1]] == ["--pixel-sigma", "0.4", "again.geojson"]
+        (again,) = [tmp_path / words[-1]]
+        invoked(*words[1:-1], again)
+        assert (
+            json.loads(again.read_text())["features"]
+            == json.loads((tmp_path / "points.geojson").read_text())["features"]
+        )
+
+    def test_a_group_has_a_command_that_needs_no_name(self, command: Command) -> None:
+        for words in ("board", "board print", "board measure"):
+            name = words.partition(" ")[2] or "print"
+            assert f"kcal board {name} [OPTIONS]" in command(f"{words} --help").out
+        for words in ("board", "board nowhere"):
+            assert "kcal board print [OPTIONS]" in command(words, code=2).err
+
+    def test_a_camera_is_named_where_there_are_several(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        for name in ("left", "right"):
+            observe(corner_pixels(8, 3, noise=0.05)).save(tmp_path / f"{name}.obs.json")
+        assert "left" not in invoked("calibrate", "left.obs.json", "-o", "a.json", "--model", "pinhole").splitlines()
+        both = invoked("calibrate", "left.obs.json", "right.obs.json", "-o", ".", "--model", "pinhole").splitlines()
+        assert "left" in both
+        assert "right" in both
