@@ -125,6 +125,7 @@ class PointLocator:
                 raise InputError("height: this rig has no place on the Earth; solve it with landmarks or positions")
         with torch.no_grad():
             self.cameras = camera_views(localize)
+            self.buried = [] if ground is None else _buried(self.cameras, ground)
 
     @torch.no_grad()
     def __call__(self, marks: Marks) -> PositionColumns:
@@ -182,7 +183,11 @@ class PointLocator:
                 for row in found.misfit.tolist()
             ],
         }
-        return _as_columns(marks, found, _view_reasons(rig, found), self._numbers(own, []), extras)
+        reasons = _view_reasons(rig, found)
+        for i in (found.status == int(PositionStatus.BEARING_ONLY)).nonzero()[:, 0].tolist():
+            if self.buried and int(found.used[i].sum()) == 1:
+                reasons[i] = self.buried[int(found.used[i].int().argmax())] or reasons[i]
+        return _as_columns(marks, found, reasons, self._numbers(own, []), extras)
 
     def _numbers(self, found: Localization, more: Sequence[Group]) -> NDArray[np.float64]:
         ok = (found.status == int(PositionStatus.OK)).numpy()
@@ -249,6 +254,18 @@ def camera_views(localize: Localizer) -> tuple[Viewpoint, ...]:
         azimuths = None if ends is None else tuple(azimuth_elevation(ends @ look.T)[:, 0].tolist())
         views.append(Viewpoint(name=name, enu=tuple(enu.tolist()), geodetic=tuple(place), azimuths_deg=azimuths))
     return tuple(views)
+
+
+def _buried(cameras: Sequence[Viewpoint], ground: Ground) -> list[str]:
+    """For each camera why its lines of sight may never meet the ground; empty where nothing is wrong."""
+    lat, lon, height = torch.tensor([camera.geodetic for camera in cameras], dtype=torch.float64).mT
+    texts = []
+    for camera, depth in zip(cameras, (ground(lat, lon) - height).tolist(), strict=True):
+        why = f"stands {depth:.1f} m below the terrain: is its height above the ellipsoid, as the terrain's is?"
+        if math.isnan(depth):
+            why = "stands where the terrain has no height: does the terrain cover its latitude and longitude?"
+        texts.append(f"only the bearing is known: camera {camera.name} {why}" if not depth <= 0 else "")
+    return texts
 
 
 def _pair_reason(status: PositionStatus, found: Localization, i: int, baseline: float, exchanged: bool) -> str:

@@ -10,8 +10,8 @@ import pyproj
 import pytest
 import torch
 
-from kcal import Camera, FileError, InputError, Localizer, Origin, Rig
-from kcal.locate import enu_from_cam, geodetic_to_enu, level_ground, terrain
+from kcal import Camera, FileError, InputError, Localizer, Origin, PositionStatus, Rig, locate_points
+from kcal.locate import Marks, enu_from_cam, geodetic_to_enu, level_ground, terrain
 from kcal.locate.ground import Ground
 from kcal.locate.localizer import Localization
 from kcal.rig import Mounting, mounting_covariance, station_rig
@@ -141,6 +141,28 @@ def test_ground_in_the_first_cell_is_found(tmp_path: Path) -> None:
     flat = on_ground(stands(), pixels, terrain(tmp_path / "flat.asc"), 0.3)
     torch.testing.assert_close(flat.enu, on_ground(stands(), pixels, level_ground(10.0), 0.3).enu, rtol=0, atol=1e-3)
     assert on_ground(stands(), pixels, terrain(tmp_path / "flat.asc", 51.0), 0.3).status.tolist() == [6]
+
+
+def test_a_camera_below_the_terrain_or_beside_it_is_named(tmp_path: Path) -> None:
+    """In place of "only the bearing is known", which is true of a place in the sky as well."""
+    rig = station_rig({"one": CAMERA}, [stands(pitch_deg=0.0)], refraction=0.0, refraction_sigma=0.0)
+    marks = Marks(names=["low", "sky"], pixels=torch.tensor([[[960.0, 640.0]], [[960.0, 100.0]]]).double())
+    (tmp_path / "flat.asc").write_text(
+        "ncols 3\nnrows 3\nxllcorner 72.8\nyllcorner 19.0\ncellsize 0.05\n" + ("60 " * 3 + "\n") * 3
+    )
+    (tmp_path / "away.asc").write_text("ncols 2\nnrows 2\nxllcorner 7\nyllcorner 45\ncellsize 0.05\n60 60\n60 60\n")
+
+    def why(name: str, geoid: float) -> list[str]:
+        found = locate_points(rig, marks, ground=terrain(tmp_path / name, geoid), height=(0.0, 1.0))
+        assert [PositionStatus(k) for k in found.columns.status] != [PositionStatus.OK, PositionStatus.OK]
+        return [reason.partition(": ")[2] for reason in found.columns.reasons]
+
+    below = "camera one stands 12.5 m below the terrain: is its height above the ellipsoid, as the terrain's is?"
+    assert why("flat.asc", 12.5) == [below, below]
+    beside = "camera one stands where the terrain has no height: does the terrain cover its latitude and longitude?"
+    assert why("away.asc", 0.0) == [beside, beside]
+    low, sky = why("flat.asc", -12.5)
+    assert (low, "one camera" in sky) == ("", True)
 
 
 def test_unknown_ground_is_not_guessed(tmp_path: Path) -> None:
