@@ -451,8 +451,8 @@ def rig_check_command(
     With `--relock rig.json` a rig with the present attitudes is written, if these have changed beyond chance. It may be
     the same file: the old one is kept beside it.
 
-    The exit code is 3 if a camera has turned beyond chance, relocked or not; 0 if none has; 1 if that could not be
-    measured.
+    The exit code is 3 if a camera has turned or moved beyond chance, relocked or not; 0 if none has; 1 if that could
+    not be measured.
 
     **Examples**
 
@@ -492,11 +492,11 @@ def rig_check_command(
     warn(*(f"{text}: its turn is wrong" for text in drift.moved))
     if drift.significant:
         print_styled("the relative attitude has changed beyond chance: ranges by the old rig are wrong", "changed")
-    else:
+    elif not drift.moved:
         out.print("no change of the relative attitude beyond chance")
     if drift.left_significant:
         print_styled("the left camera has turned beyond chance: directions by the old rig are wrong", "turned")
-    if not (drift.significant or drift.left_significant):
+    if not (drift.significant or drift.left_significant or drift.moved):
         if relock is not None:
             out.print("nothing was written")
         return

@@ -17,6 +17,7 @@ from calibrate_scenes import corner_pixels, observe
 from command_line import Command, invoked
 from typer.testing import CliRunner, Result
 
+import kcal
 from kcal.cli.board import _of_each_camera
 from kcal.cli.console import print_left_out
 from kcal.cli.demo import locate_again
@@ -167,6 +168,26 @@ class TestSources:
                               ("mill=3±1", "FIRST:SECOND=LENGTH"), ("3±1", "of 3 cameras")):  # fmt: skip
             with pytest.raises(InputError, match=message):
                 parse_baselines(text, names)
+
+
+@pytest.mark.parametrize("moved", [(), ("the left camera has moved by some 0.3 m",)])
+def test_a_rig_whose_camera_moved_is_not_as_it_was(
+    moved: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
+) -> None:
+    """Even where no turn is beyond chance; and turns do not correct it."""
+    monkeypatch.chdir(tmp_path)
+    save_rig(Rig.pair(*CAMERAS, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0])), tmp_path / "rig.json")
+    rows = [f"p{k},{100 * k},{k * k % 7 * 150},{100 * k - 8},{k * k % 7 * 150}" for k in range(1, 19)]
+    Path("marks.csv").write_text("\n".join(["name,left_u,left_v,right_u,right_v", *rows]) + "\n")
+    check = kcal.rig.check_rig
+    monkeypatch.setattr("kcal.rig.check_rig", lambda *a, **k: dataclasses.replace(check(*a, **k), moved=moved))
+    words = "rig check rig.json --reference marks.csv --marks marks.csv --pixel-sigma 0.1"
+    said = command(words, code=3 if moved else 0)
+    assert ("no change of the relative attitude" in said.out) is not bool(moved)
+    assert ("warning: the left camera has moved by some 0.3 m: its turn is wrong" in said.err) is bool(moved)
+    said = command(words, "--relock new.json", code=1 if moved else 0)
+    assert ("turns alone do not correct the rig" in said.err) is bool(moved)
+    assert not Path("new.json").exists()
 
 
 class TestTold:
