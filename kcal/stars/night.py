@@ -113,9 +113,8 @@ def fit_attitude(
     off = (error.reshape(2, -1) / weight).T.numpy()
     residual = np.full(pixels.shape, np.nan)
     residual[star >= 0] = off
-    freedom = max(2 * len(off) - 3, 1)
     chi2 = float(((off / sigma[star >= 0, None]) ** 2).sum())
-    widened = max(math.sqrt(chi2 / freedom), 1.0)
+    widened = max(math.sqrt(chi2 / (2 * len(off) - 3)), 1.0)
     own = torch.linalg.inv(white.T @ white) * widened**2
     return Attitude(
         rotation=turn,

@@ -45,6 +45,16 @@ def test_useful_frames_are_kept_and_on_the_disk(tmp_path: Path) -> None:
         CaptureSession(tmp_path / "left.obs.json", Board(columns=7, rows=5, square=0.02))
 
 
+def test_noise_is_no_movement_and_a_little_movement_no_new_view(tmp_path: Path) -> None:
+    session = CaptureSession(tmp_path / "left.obs.json", BOARD)
+    noisy = images()[0] ^ (np.arange(images()[0].shape[1]) % 2).astype(np.uint8)
+    assert not session.offer(images()[0], "a", moving=True)
+    assert session.offer(noisy, "b", moving=True)
+    assert session.corners is not None
+    assert not session.offer(np.roll(images()[0], 3, 1), "c", moving=False)
+    assert "one like this" in session.message
+
+
 @pytest.mark.slow
 def test_from_the_first_view_to_the_goal(tmp_path: Path) -> None:
     session = CaptureSession(tmp_path / "left.obs.json", BOARD, CaptureOptions(until=50.0))

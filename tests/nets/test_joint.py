@@ -169,6 +169,13 @@ def test_a_new_one_corrects_nothing_and_leaves_skew_alone() -> None:
     assert torch.equal(residual.camera().params, residual())
 
 
+def test_inputs_are_shares_of_the_largest_coefficient_and_corrections_small_ones_of_the_camera() -> None:
+    start = Camera.build(focal=(800, 820), center=(300, 200), size=SIZE, coefficients=[-0.2, 0.05, 0.0, 0.001, 0.0])
+    residual = ResidualNet(start)
+    assert residual.inputs[:, 0].tolist() == pytest.approx([-1.0, 0.25, 0.0, 0.005, 0.0])
+    assert residual.units.tolist() == pytest.approx([0.81] * 4 + [2e-3, 5e-4, 1e-9, 1e-5, 1e-9])
+
+
 def test_slopes_are_those_of_autograd_and_numeric_ones() -> None:
     start = start_of("opencv14")
     residual = ResidualNet(start, hidden=3)

@@ -103,6 +103,9 @@ class TestNames:
 
 def test_how_wide_a_camera_sees() -> None:
     assert field_angle(CAMERA) == pytest.approx(2.0 * math.atan(math.hypot(319.5, 239.5) / 1000.0))
+    # The corner that is farthest from the principal point tells.
+    aside = Camera.build(focal=(1000, 1000), center=(200, 100), size=(640, 480), model="pinhole")
+    assert field_angle(aside) == pytest.approx(2.0 * math.atan(math.hypot(439, 379) / 1000.0))
     # A fisheye whose lens does not reach the image's corners: as far as it goes, not the whole sphere.
     fisheye = Camera.build(
         focal=(200, 200), center=(319.5, 239.5), size=(640, 480), coefficients=[0.0] * 4, model="fisheye4"
