@@ -110,7 +110,7 @@ def expanded(name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
         InputError: its shape does not broadcast to that one.
     """
     own = tuple(value.shape)
-    if len(own) > len(shape) or not all(a in (1, b) for a, b in zip(reversed(own), reversed(shape), strict=False)):
+    if len(own) > len(shape) or not all(a == 1 or a == b for a, b in zip(reversed(own), reversed(shape), strict=False)):
         raise InputError(f"{name}: a shape that broadcasts to {tuple(shape)} is needed, got {own}")
     return value.expand(shape)
 

@@ -12,6 +12,7 @@ from torch._dynamo.testing import CompileCounterWithBackend
 from whole_graphs import traced_whole
 
 from kcal import Camera, Localizer, Origin, Rig
+from kcal.checks import expanded
 from kcal.lens import LensModel, Unproject
 from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
@@ -178,3 +179,12 @@ def test_forward_derivatives_take_all_steps() -> None:
     points = torch.rand(1, 3).double() + 0.5
     slope = torch.func.jacfwd(lambda points: module(points)[0])
     torch.testing.assert_close(torch.compile(slope, backend="eager")(points), slope(points), rtol=0, atol=1e-8)
+
+
+def test_a_mask_fits_where_the_number_of_rows_is_a_symbol() -> None:
+    """A size that a compiler leaves open is no member of a tuple."""
+    fit = torch.compile(
+        lambda mask, rows: expanded("mask", mask, rows.shape[:-1]), fullgraph=True, dynamic=True, backend="eager"
+    )
+    for count in (5, 7, 9):
+        assert fit(torch.ones(count, dtype=torch.bool), torch.zeros(count, 2)).shape == (count,)

@@ -155,13 +155,13 @@ class RefineCorners(nn.Module):
             raise InputError("RefineCorners: side is needed, (B, N) pixels, or a module with a grid that tells it")
         if image.is_floating_point():
             require_finite("image", image.detach())
+        if not pixels.numel():
+            return saddles.Refined(pixels, pixels[..., 0].long())
         done = []
         for number, light in enumerate(image[:, 0]):
             known = side[number] if side is not None else local_side(pixels[number], *(self.grid or (0, 0)))
             levels = None if light.is_floating_point() else _saturation_levels(int(light.max()))
             done.append(_of_one_image(light, pixels[number], known, self.method, self.grid, levels))
-        if not done:
-            return saddles.Refined(pixels, pixels[..., 0].long())
         parts = {name: [getattr(each, name) for each in done] for name in saddles.Refined._fields}
         return saddles.Refined(**{name: torch.stack(part) for name, part in parts.items() if part[0] is not None})
 

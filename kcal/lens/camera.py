@@ -213,6 +213,8 @@ class Camera(ConvertibleCamera):
                     known = None if differentiated else lens
                     valid = valid & in_region(x, y, coefficients, self.model, self.valid_region, known)
             pixels = torch.stack(to_pixels(lens.x, lens.y, values), -1)
+            # Of lenses without coefficients one region serves all cameras.
+            valid = valid.expand(pixels.shape[:-1])
             return pixels if all_valid and settled else torch.where(valid[..., None], pixels, center), valid
 
         return self._in_chunks(one, points)

@@ -283,8 +283,9 @@ class Unproject(nn.Module):
     `kcal.io.lookup_file.save_onnx` writes the module as ONNX.
 
     Args:
-        camera: the camera, kept as a submodule.
-        start: a trained `InverseNet`; its guess is where Newton's method starts. It affects run time only.
+        camera: the camera, kept as a submodule, or a `CameraLike`.
+        start: for a `Camera`, a trained `InverseNet`; its guess is where Newton's method starts. It affects run time
+            only.
 
     Example:
         >>> import torch
@@ -296,14 +297,16 @@ class Unproject(nn.Module):
 
     __repr__ = brief
 
-    def __init__(self, camera: Camera, start: LearnedStart | None = None) -> None:
+    def __init__(self, camera: Camera | CameraLike, start: LearnedStart | None = None) -> None:
         super().__init__()
-        self.camera = camera
+        if start is not None and not isinstance(camera, Camera):
+            raise InputError("start: it begins Newton's method of kcal's own lenses; leave it out for another camera")
+        self.camera: Camera = as_camera(camera)
         self.start = start
 
     def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Map pixels (..., N, 2) to rays (..., N, 3) of length one, and valid (..., N)."""
-        return self.camera.unproject(pixels, start=None if self.start is None else self.start.guess)
+        return self.camera.unproject(pixels, **({} if self.start is None else {"start": self.start.guess}))
 
 
 # The ray of every pixel, for renderers that take rays in place of a camera model: gsplat, splatting and NeRFs.

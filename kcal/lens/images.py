@@ -15,7 +15,7 @@ from kcal.dispatch import is_differentiated, is_traced, may_branch, still
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
 from kcal.lens.camera_like import CameraLike, as_camera
-from kcal.lens.rig import Rig
+from kcal.lens.rig import Rig, check_single
 from kcal.lens.views import (
     Cylinder,
     TurnedCamera,
@@ -221,12 +221,13 @@ class Undistort(StatedModule):
             return self._grid(precision)
         # Compiled and exported graphs keep their maps, because comparing values would break the graph. In an eager call
         # the comparison takes some microseconds, and a stale map would give a wrong image.
-        if not compiling and (self.grid.dtype != precision or not torch.equal(self._made_from, self._camera_values())):
+        grid, mask = self.grid, self.mask  # which another thread may change
+        if not compiling and (grid.dtype != precision or not torch.equal(self._made_from, self._camera_values())):
             # Maps that are kept serve differentiated calls, too.
             with torch.inference_mode(False), torch.no_grad():
-                self.grid, self.mask = self._grid(precision)
+                self.grid, self.mask = grid, mask = self._grid(precision)
                 self._made_from = self._camera_values()
-        return self.grid, self.mask
+        return grid, mask
 
     def _pixel_maps(self) -> Tensor:
         """(..., 2, H', W') the kept grid as columns and rows of the source, as OpenCV takes them."""
@@ -412,6 +413,7 @@ class StereoRectification(Float64Module):
         at: float = math.inf,
     ) -> None:
         super().__init__()
+        check_single(rig, "StereoRectification")
         self.rig, rig = rig, still(rig)
         turn = _rectified_frame(rig)
         left, right = turn, rig.right_from_left_rotation @ turn

@@ -362,6 +362,13 @@ class Rig(Movable, StatedModule):
         else:
             super().__setattr__(name, value)
 
+    def __copy__(self) -> Self:
+        """The same cameras, poses and errors in a rig on which others can be set without changing this one."""
+        same = type(self).__new__(type(self))
+        vars(same).update({name: copy.copy(v) if isinstance(v, dict) else v for name, v in vars(self).items()})
+        same.cameras = nn.ModuleList(self.cameras)
+        return same
+
     @property
     def each(self) -> list[Camera]:
         """The cameras."""
@@ -661,6 +668,14 @@ class Rig(Movable, StatedModule):
             pixels.append(pixel)
             seen.append(valid & camera.inside(pixel))
         return torch.stack(pixels, -2), torch.stack(seen, -1)
+
+
+def check_single(rig: Rig, what: str) -> None:
+    """Raise `InputError` if a camera of the rig is a batch of cameras."""
+    for name, camera in zip(rig.names, rig.each, strict=True):
+        if camera.params.ndim != 1:
+            lead = tuple(camera.params.shape[:-1])
+            raise InputError(f"{what}: single cameras are needed; {name} is a batch of {lead}: give one rig for each")
 
 
 def _of_two(rig: Rig, wanted: str) -> Rig:

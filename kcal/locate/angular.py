@@ -154,13 +154,18 @@ def triangulate_angular(cam_from_world: Tensor, rays: Tensor, seen: Tensor | Non
         >>> [round(value, 6) for value in triangulate_angular(cameras, rays).points[0].abs().tolist()]
         [0.0, 0.0, 5000.0]
     """
-    cam_from_world, rays = checked_rays(cam_from_world, rays)
+    cam_from_world, rays, seen = checked_rays(cam_from_world, rays, seen)
     rotation, translation = cam_from_world[..., :3], cam_from_world[..., 3]
-    if cam_from_world.ndim == 3 and len(cam_from_world) == 2:
-        turn = rotation[1] @ rotation[0].mT
-        found = triangulate_pairs(rays[..., 0, :], rays[..., 1, :], (turn, translation[1] - turn @ translation[0]))
-        world = (found.points - translation[0]) @ rotation[0]
-        return Found(world, found.valid)
+    if rays.shape[-2] == 2:
+        seen = torch.ones_like(rays[..., 0], dtype=torch.bool) if seen is None else seen
+        lead = torch.broadcast_shapes(rotation.shape[:-3], rays.shape[:-3], seen.shape[:-2])
+        if rotation.ndim == 3:
+            return _two_rays(rotation, translation, rays, seen)
+        each = (rotation, 3), (translation, 2), (rays, 3), (seen, 2)
+        found = torch.func.vmap(_two_rays)(*(
+            value.expand(*lead, *value.shape[-own:]).flatten(0, -own - 1) for value, own in each
+        ))  # fmt: skip
+        return Found(*(value.reshape(*lead, *value.shape[1:]) for value in found))
     centers = -(rotation.mT @ translation[..., None])[..., 0]
     length = torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
     usable = torch.isfinite(length) & (length > 0)
@@ -179,6 +184,16 @@ def triangulate_angular(cam_from_world: Tensor, rays: Tensor, seen: Tensor | Non
     return Found(first + torch.where(valid[..., None], points, 0.0), valid)
 
 
+def _two_rays(rotation: Tensor, translation: Tensor, rays: Tensor, seen: Tensor) -> Found:
+    """`triangulate_pairs` for two cameras, rotations (2, 3, 3) and translations (2, 3); not where one is blind."""
+    turn = rotation[1] @ rotation[0].mT
+    left, right = torch.where(seen.all(-1)[..., None, None], rays, 0.0).unbind(-2)
+    found = triangulate_pairs(left, right, (turn, translation[1] - turn @ translation[0]))
+    world = (found.points - translation[0]) @ rotation[0]
+    one = (seen[..., 1] & ~seen[..., 0])[..., None]
+    return Found(torch.where(one, -translation[1] @ rotation[1], world), found.valid)
+
+
 def first_seen(seen: Tensor) -> Tensor:
     """(..., C) bool: true for the first camera alone of those that saw something.
 
@@ -189,8 +204,8 @@ def first_seen(seen: Tensor) -> Tensor:
     return seen & (seen.to(torch.int64).cumsum(-1) == 1)
 
 
-def checked_rays(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Both as float64, their shapes (..., C, 3, 4) and (..., N, C, 3) checked."""
+def checked_rays(cam_from_world: Tensor, rays: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Matrices (..., C, 3, 4) and rays (..., N, C, 3) as float64, and who saw what (..., N, C); shapes are checked."""
     cam_from_world = as_points("cam_from_world", cam_from_world, 4)
     rays = as_points("rays", rays, 3)
     if cam_from_world.ndim < 3 or cam_from_world.shape[-2] != 3 or cam_from_world.shape[-3] < 2:
@@ -199,7 +214,13 @@ def checked_rays(cam_from_world: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
         raise InputError(
             f"rays: shape (..., N, {cam_from_world.shape[-3]}, 3) is needed to fit the cameras, got {tuple(rays.shape)}"
         )
-    return cam_from_world, rays
+    if seen is not None:
+        seen = torch.as_tensor(seen, device=rays.device)
+        if seen.dtype != torch.bool or seen.ndim < 2 or seen.shape[-1] != rays.shape[-2]:
+            raise InputError(
+                f"seen: bool of shape (..., N, {rays.shape[-2]}) is needed, got {seen.dtype} of {tuple(seen.shape)}"
+            )
+    return cam_from_world, rays, seen
 
 
 def _several_rays(ray: Tensor, world: Sequence[Tensor], shifts: Tensor, seen: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -213,8 +234,9 @@ def _several_rays(ray: Tensor, world: Sequence[Tensor], shifts: Tensor, seen: Te
     for _ in range(2):
         rows = [_across_ray(w, (e1, e2, shifts[..., c, :], -ray), weights[c]) for c, w in enumerate(world)]
         p, q, u, r, v, s, f, g, h = (torch.stack(terms).sum(0) for terms in zip(*rows, strict=True))
-        # The upper 2x2 block is never worse than the identity, from the first camera.
-        scale = (p * r - q * q).reciprocal()
+        # The upper 2x2 block is never worse than the identity, from the first camera; of what nobody saw it is zero.
+        area = p * r - q * q
+        scale = torch.where(area > 0, area, 1.0).reciprocal()
         first, second = (r * u - q * v) * scale, (p * v - q * u) * scale
         left = s - first * u - second * v
         determined = left > EPIPOLE**2
@@ -284,7 +306,7 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor, seen: Tensor | None
         >>> round(points[0, 2].item(), 6), valid.tolist()
         (5000.0, [True])
     """
-    cam_from_world, rays = checked_rays(cam_from_world, rays)
+    cam_from_world, rays, seen = checked_rays(cam_from_world, rays, seen)
     rotation, translation = cam_from_world[..., :3], cam_from_world[..., 3]
     centers = -(rotation.mT @ translation[..., None])[..., 0]
     middle = centers.mean(-2, keepdim=True)
@@ -297,7 +319,7 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor, seen: Tensor | None
     usable = ((torch.isfinite(length) & (length > 0))[..., 0] | ~counts).all(-1) & (counts.sum(-1) > 1)
     usable = usable[..., None, None]
     ahead = rays.new_tensor([0.0, 0.0, 1.0])
-    units = torch.where(usable, rays, ahead)
+    units = torch.where(usable & counts[..., None], rays, ahead)
     units = units / torch.linalg.vector_norm(units, dim=-1, keepdim=True)
     if seen is not None:
         units = torch.where(seen[..., None], units, 0.0)

@@ -21,7 +21,7 @@ from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.calibration import noise_of_marks
 from kcal.lens.pose import Movable, rotation_from_vector
-from kcal.lens.rig import Origin, Rig
+from kcal.lens.rig import Origin, Rig, check_single
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, mean_radius, place_enu
 from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
@@ -152,6 +152,7 @@ class Localizer(Operations, Movable, StatedModule):
             self._stand(rig)
             self._weigh(rig)
             return
+        check_single(rig, 'weights "all"')
         self.rig = rig = Localizer(rig, weights="marks").apart() if rig.is_pair else rig
         known = rig.root is not None and bool(rig.root.any())
         self.included: tuple[str, ...] = ("marks", "calibration", "mounting") if known else ("marks",)
@@ -328,13 +329,22 @@ class Localizer(Operations, Movable, StatedModule):
                     f"seen: bool is needed; left and right are pixels of two cameras, and this rig has {count}"
                 )
             left, right = stereo.checked_pairs(pixels, other, self.rig)
-            if self.weights == "marks" and velocity is None and height is None:
+            each = cov is not None and as_tensor("cov", cov).shape[-1:] == (2,)
+            if self.weights == "marks" and velocity is None and height is None and not each:
                 return self._of_pairs(left, right, stereo.checked_covariance(cov, left.shape[:-1], (4, 4), left), mask)
             pixels, other = torch.stack([left, right], -2), None
         pixels, seen = stereo.checked_views(pixels, other, count, like)
         lead = pixels.shape[:-2]
         if mask is not None:
             seen = seen & stereo.checked_mask(mask, lead, pixels.device)[..., None]
+        mixed: Tensor | None = None
+        if cov is not None and count == 2 and as_tensor("cov", cov).shape[-2:] == (4, 4):
+            joint = stereo.checked_covariance(cov, lead, (4, 4), pixels)
+            assert joint is not None
+            cov = torch.stack([joint[..., :2, :2], joint[..., 2:, 2:]], -3)
+            mixed = joint - stereo.joint_covariance(cov)
+            if self.weights == "all" and not known_true(mixed == 0):
+                raise InputError('cov: with weights="all" marks are independent; give shape (..., N, 2, 2, 2)')
         cov = stereo.checked_covariance(cov, lead, (count, 2, 2))
         if velocity is not None:
             moved = self.clock_sigma * expanded("velocity", as_points("velocity", velocity, 2, pixels), pixels.shape)
@@ -345,7 +355,7 @@ class Localizer(Operations, Movable, StatedModule):
             if height is not None:
                 raise InputError('height: a rig of two cameras uses it with weights="all"')
             left, right = pixels.unbind(-2)
-            cov = None if cov is None else stereo.joint_covariance(cov)
+            cov = None if cov is None else stereo.joint_covariance(cov) + (0.0 if mixed is None else mixed)
             return self._of_pairs(left, right, cov, None if known_true(seen) else seen.all(-1))
         if height is not None:
             if not self.on_earth:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kcal.checks import StatedModule, require_finite
-from kcal.dispatch import host_values, is_differentiated, is_traced, may_branch
+from kcal.dispatch import host_values, is_differentiated, is_traced, known_true, may_branch
 from kcal.errors import InputError
 from kcal.texts import brief
 
@@ -268,14 +268,26 @@ def attach_implicit_gradient(
         r = residual(x, *element)
         return 0.5 * (r * r).sum()
 
+    lead, at = solution.ndim - 1, (solution, *data)
+    if not known_true(converged):
+        # What is not finite would make derivatives by what elements share so, although it counts zero: one that
+        # converged stands in.
+        one = converged.reshape(-1).to(torch.int8).argmax().reshape(1)
+        at = tuple(_where(converged, value, one) for value in at)
     gradient, hessian = torch.func.grad(cost), torch.func.hessian(cost)
-    for _ in range(solution.ndim - 1):
+    for _ in range(lead):
         gradient, hessian = torch.func.vmap(gradient), torch.func.vmap(hessian)
     with torch.no_grad():
-        inverse = torch.linalg.pinv(hessian(solution, *data), hermitian=True)
-    step = -(inverse @ gradient(solution, *data)[..., None])[..., 0]
+        inverse = torch.linalg.pinv(hessian(*at), hermitian=True)
+    step = -(inverse @ gradient(*at)[..., None])[..., 0]
     step = torch.where(converged[..., None], step, 0.0)
     return solution + (step - step.detach())
+
+
+def _where(mask: Tensor, value: Tensor, one: Tensor) -> Tensor:
+    """`value` (*mask.shape, ...), elsewhere a finite copy of the element of number `one` (1,)."""
+    each = value.detach().reshape(-1, *value.shape[mask.ndim :]).index_select(0, one)[0].nan_to_num()
+    return torch.where(mask.reshape(*mask.shape, *[1] * each.ndim), value, each)
 
 
 # Dense least squares for any residual function, batched, with Jacobians from `torch.func`.

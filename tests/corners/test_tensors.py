@@ -328,3 +328,9 @@ def test_images_without_room_for_a_board(side: int, pattern: Literal["checkerboa
         detect([image] * 3, board)
     with pytest.raises(InputError, match="give --board"):
         recognize_board(image, "25mm")
+
+
+def test_no_corners_to_refine() -> None:
+    found = RefineCorners()(IMAGES[:2, None].double(), torch.zeros(2, 0, 2), torch.zeros(2, 0))
+    assert found.pixels.shape == (2, 0, 2)
+    assert found.status.shape == (2, 0)

@@ -10,7 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from kcal import Camera, InputError, Localizer, Origin, Rig, save_rig
-from kcal.lens import CameraLike, Undistort, bake, undistort_maps
+from kcal.lens import CameraLike, StereoRectification, Undistort, Unproject, bake, undistort_maps
+from kcal.lens.camera_like import as_camera
+from kcal.nets import InverseNet
+from kcal.track import PairBoxes
 
 MODEL = Camera.build(focal=(900, 900), center=(322, 238), size=(640, 480), coefficients=[-0.1, 0.02, 1e-3, -5e-4, 0.0])
 
@@ -110,3 +113,18 @@ def test_what_needs_parameters_is_refused(tmp_path: Path) -> None:
     with torch.no_grad():
         changed.left.get_parameter("camera.focal_length").mul_(1.1)
     assert changed.fingerprint != before
+
+
+def test_a_users_camera_unprojects_as_a_module() -> None:
+    pixels = torch.tensor([[300.0, 200.0]])
+    torch.testing.assert_close(Unproject(Mine())(pixels)[0], as_camera(Mine()).unproject(pixels)[0])
+    with pytest.raises(InputError, match="start: it begins Newton's method"):
+        Unproject(Mine(), InverseNet(MODEL))
+
+
+def test_rigs_of_batches_of_cameras_are_refused_where_single_ones_are_needed() -> None:
+    several = Camera(MODEL.params.detach().repeat(3, 1), size=MODEL.size, model=MODEL.model)
+    both = rig(several, several)
+    for use in (StereoRectification, PairBoxes, lambda own: Localizer(own, weights="all")):
+        with pytest.raises(InputError, match=r"single cameras are needed; left is a batch of \(3,\)"):
+            use(both)

@@ -128,3 +128,18 @@ def test_ranges_and_covariance_without_the_earth() -> None:
     assert found.covariance[1].diagonal().tolist() == [float("inf")] * 3
     located = Localizer(own.placed(origin=Origin(lat=0, lon=0, height=0), heading_deg=0.0))(left, right)
     assert located.range.tolist() == pytest.approx([1000.0, float("inf"), float("inf")])
+
+
+def test_what_is_set_on_a_rig_elsewhere_is_not_set_on_the_first_one() -> None:
+    """A rig that was placed, or copied for other errors, has cameras and poses of its own."""
+    one = rig(free=False)
+    lens, pose, columns = one.left, one.right_from_left_translation.clone(), one.quantities
+    other = one.placed(origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0)
+    localize = Localizer(one, root=torch.zeros(1, columns, dtype=torch.float64))
+    for copied in (other, localize.rig):
+        copied.left = Camera.build(focal=(9, 9), center=(1, 1), size=lens.size, model="pinhole")
+        copied.free("right")
+        copied.pose_step.data += 1.0
+    assert one.left is lens
+    assert torch.equal(one.right_from_left_translation, pose)
+    assert not any(p.requires_grad for p in one.parameters())

@@ -393,3 +393,12 @@ def test_a_batch_is_refused() -> None:
     with pytest.raises(InputError, match="single camera"):
         paraxial_focal(Camera(camera.params.detach().expand(2, -1).clone(), size=(640, 480), model="opencv5"))
     assert math.isfinite(paraxial_focal(camera).mean[0])
+
+
+@pytest.mark.parametrize("model", ["pinhole", "opencv5"])
+def test_masks_of_a_batch_of_cameras_have_its_axis(model: str) -> None:
+    one = Camera.build(focal=(800, 810), center=(322, 238), size=(640, 480), model=model)
+    several = Camera(one.params.detach().repeat(4, 1), size=one.size, model=model)
+    pixels, valid = several.project(torch.tensor([[0.1, 0.0, 1.0], [0.0, 0.0, -1.0]]))
+    assert valid.tolist() == [[True, False]] * 4
+    assert pixels[valid].shape == (4, 2)

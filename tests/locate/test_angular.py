@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from typing import Literal
+
 import pytest
 import torch
 from locate_rigs import tensor, turned
 
+from kcal import InputError
 from kcal.lens.pose import side_axes
-from kcal.locate.angular import triangulate_angular, triangulate_linear, triangulate_pairs
+from kcal.locate.angular import triangulate, triangulate_angular, triangulate_linear, triangulate_pairs
 
 GENERATOR = torch.Generator().manual_seed(7)
 
@@ -140,3 +144,53 @@ def test_cameras_one_above_the_other() -> None:
         assert valid.all()
         # Parallaxes down to 2e-5 rad where one camera stands behind the other.
         assert ((found - points).norm(dim=-1) / points.norm(dim=-1)).max() < 1e-10
+
+
+@pytest.mark.parametrize("method", ["angular", "linear"])
+def test_who_saw_a_point_counts_for_two_cameras_too(method: Literal["angular", "linear"]) -> None:
+    """The other ray is a finite one here; alone and in a batch of rigs."""
+    cameras = torch.eye(3, 4, dtype=torch.float64).repeat(2, 1, 1)
+    cameras[1, 0, 3] = -10.0
+    rays = tensor([0.0, 0.0, 1.0], [-0.002, 0.0, 1.0]).expand(3, 2, 3)
+    seen = torch.tensor([[True, True], [True, False], [False, True]])
+    for one, lead in ((cameras, ()), (cameras[None], (1,))):
+        found = triangulate(one, rays, seen, method=method)
+        assert found.valid.reshape(3).tolist() == [True, False, False]
+        assert found.valid.shape == (*lead, 3)
+        if method == "angular":
+            wanted = tensor([0.0, 0.0, 5000.0], [0.0, 0.0, 0.0], [10.0, 0.0, 0.0])
+            torch.testing.assert_close(found.points.reshape(3, 3), wanted, rtol=1e-12, atol=1e-12)
+    for bad in (seen.double(), seen[0], seen[:, :1]):
+        with pytest.raises(InputError, match=r"seen: bool of shape \(..., N, 2\) is needed"):
+            triangulate(cameras, rays, bad, method=method)
+
+
+def test_a_batch_of_rigs_of_two_is_one_by_one() -> None:
+    """Where rays miss each other, too."""
+    rigs = torch.stack([poses(2), poses(3)[1:], poses(4)[2:]])
+    noise = 0.02 * torch.randn(3, 20, 2, 3, dtype=torch.float64, generator=GENERATOR)
+    rays = torch.stack([rays_to(world_points(20), rig) for rig in rigs]) + noise
+    found, shared = triangulate_angular(rigs, rays), triangulate_angular(rigs, rays[0])
+    for k in range(3):
+        alone = triangulate_angular(rigs[k], rays[k])
+        torch.testing.assert_close(found.points[k], alone.points, rtol=1e-12, atol=1e-12)
+        assert torch.equal(found.valid[k], alone.valid)
+        torch.testing.assert_close(
+            shared.points[k], triangulate_angular(rigs[k], rays[0]).points, rtol=1e-12, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("method", ["angular", "linear"])
+@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("unseen", [0.0, math.nan])
+def test_what_nobody_saw_has_no_gradient(method: Literal["angular", "linear"], count: int, unseen: float) -> None:
+    cameras = poses(count).requires_grad_()
+    rays = rays_to(world_points(3), cameras.detach())
+    seen = torch.ones(3, count, dtype=torch.bool)
+    seen[0], seen[1, count - 1] = False, False
+    rays = torch.where(seen[..., None], rays, unseen).requires_grad_()
+    found = triangulate(cameras, rays, seen, method=method)
+    assert found.valid.tolist() == [False, count > 2, True]
+    gradients = torch.autograd.grad(found.points[found.valid].sum(), (cameras, rays))
+    assert all(bool(each.isfinite().all()) for each in gradients)
+    assert not gradients[1][~seen].any()

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal import InputError, Localizer, PositionStatus, Rig
+from kcal import Camera, InputError, Localizer, PositionStatus, Rig
 from kcal.locate import enu_to_geodetic
 from scripts.shared import station_scenes as scenes
 from scripts.shared.station_scenes import ORIGIN, drawn_errors, marks, ring
@@ -225,3 +225,46 @@ def test_bad_arguments() -> None:
         Localizer(rig, root=torch.ones(2, 5))
     with pytest.raises(InputError, match="unlike names"):
         Rig(rig.each, ["a", "a", "b"], rig.rotation, center=rig.center)
+
+
+@pytest.mark.parametrize("lost", [math.nan, -50.0, None])
+def test_rows_that_nobody_saw_leave_gradients_alone(lost: float | None) -> None:
+    """Also those by freed poses, where cameras share errors; NaN, outside the images, or masked."""
+    rig, mask = ring(3, 5000.0).free("tower 2"), None
+    rig.root = rig.with_errors(attitude_deg=0.01)
+    pixels = marks(rig, targets(2)).detach()
+    if lost is None:
+        mask = torch.tensor([True, False])
+    else:
+        pixels[1] = lost
+    gradients = []
+    for rows, which in ((pixels, mask), (pixels[:1], None)):
+        moved = rows.clone().requires_grad_()
+        found = Localizer(rig)(moved, mask=which)
+        loss = found.inverse_range[found.status == OK].sum()
+        gradients.append(torch.autograd.grad(loss, [moved, *(p for p in rig.parameters() if p.requires_grad)]))
+    for whole, alone in zip(*gradients, strict=True):
+        torch.testing.assert_close(whole[: len(alone)] if whole.shape != alone.shape else whole, alone)
+    assert not gradients[0][0][1].any()
+
+
+def test_a_joint_covariance_of_left_and_right_serves_all_calls() -> None:
+    camera = Camera.build(focal=(1600, 1600), center=(960, 540), size=(1920, 1080), model="pinhole")
+    rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-10.0, 0.0, 0.0]))
+    left, right = torch.tensor([[960.0, 540.0]]), torch.tensor([[940.0, 540.1]])
+    joint = torch.diag(torch.tensor([0.04, 0.09, 0.01, 0.16])).double()[None]
+    each = torch.stack([joint[:, :2, :2], joint[:, 2:, 2:]], 1)
+    velocity, localize = torch.full((1, 2, 2), 30.0).double(), Localizer(rig, clock_sigma=0.01)
+    for call in (localize, Localizer(rig, weights="all", clock_sigma=0.01)):
+        for more in ({}, {"velocity": velocity}):
+            both = [call(left, right, cov, **more).covariance for cov in (joint, each)]
+            torch.testing.assert_close(*both)
+    # What marks have in common counts beside the motion: errors along the row that are alike move no range.
+    mixed = joint.clone()
+    mixed[:, 0, 2] = mixed[:, 2, 0] = 0.019
+    less = localize(left, right, mixed, velocity=velocity).inverse_range_sigma
+    more_px2 = 2 * 0.019
+    own = localize(left, right, joint, velocity=velocity).inverse_range_sigma
+    assert float(own.square() - less.square()) == pytest.approx(more_px2 / (1600.0 * 10.0) ** 2, rel=1e-3)
+    with pytest.raises(InputError, match="marks are independent"):
+        Localizer(rig, weights="all")(left, right, mixed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -69,6 +70,22 @@ class TestGradient:
         assert not bool(result.converged)
         (gradient,) = torch.autograd.grad(result.x.sum(), observed)
         assert torch.equal(gradient, torch.zeros_like(gradient))
+
+    def test_one_that_failed_leaves_what_elements_share_alone(self) -> None:
+        """Its residual is not finite, and its part of the gradient zero."""
+        weights = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64, requires_grad=True)
+
+        def residual(x: Tensor, seen: Tensor) -> Tensor:
+            return weights * (x[0] + 0.1 * x[0] ** 2 - seen)
+
+        seen = torch.tensor([[0.1, 0.2, -0.1], [math.nan, 0.0, 0.0], [0.3, -0.2, 0.5]], dtype=torch.float64)
+        found = []
+        for rows in (seen, seen[[0, 2]], seen[1:2]):
+            result = LevenbergMarquardt(residual)(torch.zeros(len(rows), 1).double(), rows)
+            found.append(torch.autograd.grad(result.x[result.converged].sum(), weights)[0])
+        assert found[1].abs().min() > 1e-3
+        torch.testing.assert_close(found[0], found[1])
+        assert not found[2].any()
 
     def test_none_without_grad(self) -> None:
         with torch.no_grad():
