@@ -166,6 +166,14 @@ def as_camera(camera: Any) -> Any:
 # cost little more than one.
 
 
+def check_single(names: Sequence[str], cameras: Sequence[Camera], what: str) -> None:
+    """Raise `InputError` if one of the cameras of a rig is a batch of cameras."""
+    for name, camera in zip(names, cameras, strict=True):
+        if camera.params.ndim != 1:
+            lead = tuple(camera.params.shape[:-1])
+            raise InputError(f"{what}: single cameras are needed; {name} is a batch of {lead}: give one rig for each")
+
+
 def stackable(cameras: Sequence[Camera]) -> bool:
     """Whether cameras have one lens model and may be computed as one batch."""
     first = cameras[0]

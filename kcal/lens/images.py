@@ -14,8 +14,8 @@ from kcal.checks import Float64Module, StatedModule, as_points, as_tensor
 from kcal.dispatch import is_differentiated, is_traced, may_branch, still
 from kcal.errors import DegenerateError, InputError
 from kcal.lens.camera import Camera
-from kcal.lens.camera_like import CameraLike, as_camera
-from kcal.lens.rig import Rig, check_single
+from kcal.lens.camera_like import CameraLike, as_camera, check_single
+from kcal.lens.rig import Rig
 from kcal.lens.views import (
     Cylinder,
     TurnedCamera,
@@ -413,7 +413,7 @@ class StereoRectification(Float64Module):
         at: float = math.inf,
     ) -> None:
         super().__init__()
-        check_single(rig, "StereoRectification")
+        check_single(rig.names, rig.each, "StereoRectification")
         self.rig, rig = rig, still(rig)
         turn = _rectified_frame(rig)
         left, right = turn, rig.right_from_left_rotation @ turn

@@ -670,14 +670,6 @@ class Rig(Movable, StatedModule):
         return torch.stack(pixels, -2), torch.stack(seen, -1)
 
 
-def check_single(rig: Rig, what: str) -> None:
-    """Raise `InputError` if a camera of the rig is a batch of cameras."""
-    for name, camera in zip(rig.names, rig.each, strict=True):
-        if camera.params.ndim != 1:
-            lead = tuple(camera.params.shape[:-1])
-            raise InputError(f"{what}: single cameras are needed; {name} is a batch of {lead}: give one rig for each")
-
-
 def _of_two(rig: Rig, wanted: str) -> Rig:
     """The rig, if it is one of two cameras."""
     if len(rig) != 2:

@@ -20,8 +20,9 @@ from kcal.dispatch import is_differentiated, is_traced, known_true
 from kcal.errors import InputError
 from kcal.io.rig_file import load_rig
 from kcal.lens.calibration import noise_of_marks
+from kcal.lens.camera_like import check_single
 from kcal.lens.pose import Movable, rotation_from_vector
-from kcal.lens.rig import Origin, Rig, check_single
+from kcal.lens.rig import Origin, Rig
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, mean_radius, place_enu
 from kcal.locate.ground import EarthFrame, Ground, stated_ahead
 from kcal.locate.max_likelihood import by_pose, calibration_effect, inverse_variance, position_slope, symmetric
@@ -152,7 +153,7 @@ class Localizer(Operations, Movable, StatedModule):
             self._stand(rig)
             self._weigh(rig)
             return
-        check_single(rig, 'weights "all"')
+        check_single(rig.names, rig.each, 'weights "all"')
         self.rig = rig = Localizer(rig, weights="marks").apart() if rig.is_pair else rig
         known = rig.root is not None and bool(rig.root.any())
         self.included: tuple[str, ...] = ("marks", "calibration", "mounting") if known else ("marks",)
@@ -329,8 +330,7 @@ class Localizer(Operations, Movable, StatedModule):
                     f"seen: bool is needed; left and right are pixels of two cameras, and this rig has {count}"
                 )
             left, right = stereo.checked_pairs(pixels, other, self.rig)
-            each = cov is not None and as_tensor("cov", cov).shape[-1:] == (2,)
-            if self.weights == "marks" and velocity is None and height is None and not each:
+            if self.weights == "marks" and velocity is None and height is None:
                 return self._of_pairs(left, right, stereo.checked_covariance(cov, left.shape[:-1], (4, 4), left), mask)
             pixels, other = torch.stack([left, right], -2), None
         pixels, seen = stereo.checked_views(pixels, other, count, like)

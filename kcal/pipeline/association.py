@@ -17,7 +17,8 @@ from kcal.checks import StatedModule, as_points, exportable
 from kcal.corners.patches import as_gray
 from kcal.dispatch import is_differentiated, still
 from kcal.errors import InputError
-from kcal.lens.rig import Rig, check_single
+from kcal.lens.camera_like import check_single
+from kcal.lens.rig import Rig
 from kcal.locate.localizer import Localizer
 from kcal.locate.views import CommonErrors, PosedCameras, ViewsFit, common_variance, fit_views
 from kcal.pipeline.assignment import assign_groups
@@ -354,7 +355,7 @@ class PairBoxes(StatedModule):
 
     def __init__(self, rig: Rig, options: AssociationOptions | None = None) -> None:
         super().__init__()
-        check_single(rig, "PairBoxes")
+        check_single(rig.names, rig.each, "PairBoxes")
         self.rig, self.options = rig, options or AssociationOptions()
         if isinstance(self.options.anchor, int):
             raise InputError("PairBoxes: boxes have no keypoints; anchor 'center' or 'bottom' is needed")

@@ -255,10 +255,11 @@ def test_a_joint_covariance_of_left_and_right_serves_all_calls() -> None:
     joint = torch.diag(torch.tensor([0.04, 0.09, 0.01, 0.16])).double()[None]
     each = torch.stack([joint[:, :2, :2], joint[:, 2:, 2:]], 1)
     velocity, localize = torch.full((1, 2, 2), 30.0).double(), Localizer(rig, clock_sigma=0.01)
+    both = torch.stack([left, right], 1)
     for call in (localize, Localizer(rig, weights="all", clock_sigma=0.01)):
         for more in ({}, {"velocity": velocity}):
-            both = [call(left, right, cov, **more).covariance for cov in (joint, each)]
-            torch.testing.assert_close(*both)
+            found = call(left, right, joint, **more).covariance
+            torch.testing.assert_close(found, call(both, cov=each, **more).covariance)
     # What marks have in common counts beside the motion: errors along the row that are alike move no range.
     mixed = joint.clone()
     mixed[:, 0, 2] = mixed[:, 2, 0] = 0.019
