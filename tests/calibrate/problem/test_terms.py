@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcal import Observations
 from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.calibrate.problem.parameters import FoldBarrier, GaussianPrior, Term
+from kcal.calibrate.problem.parameters import FoldBarrier, GaussianPrior, ParameterConstraints, Term
 from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.pose import apply_twist
 from kcal.solve import RobustLoss
@@ -30,6 +30,15 @@ def test_a_step_is_the_exponential_of_its_twist(size: float) -> None:
     torch.testing.assert_close(moved[0], expected[:, :3, :3] @ rotation, rtol=0, atol=1e-13)
     image = (expected[:, :3, :3] @ translation[..., None])[..., 0] + expected[:, :3, 3]
     torch.testing.assert_close(moved[1], image, rtol=0, atol=1e-13)
+
+
+def test_constraints_hold_what_the_lens_has() -> None:
+    """Fixed parameters, and ties, also of names that this lens does not have."""
+    model, values = LensModel.named("opencv5"), torch.arange(10.0, dtype=torch.float64)
+    held = ParameterConstraints(fixed={"cx": 7.5, "k6": 1.0}, tied=(("fx", "fy"), ("k1", "k4", "k2"), ("s1", "s2")))
+    names = ["fx", "fy", "cx", "cy", "skew", *model.names]
+    wanted = dict(zip(names, values.tolist(), strict=True)) | {"fx": 0.5, "fy": 0.5, "cx": 7.5, "k1": 5.5, "k2": 5.5}
+    assert held.impose(values, model).tolist() == list(wanted.values())
 
 
 def barrier_values(model: LensModel, radial: dict[str, float]) -> Tensor:
