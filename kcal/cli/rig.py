@@ -452,7 +452,7 @@ def rig_check_command(
     the same file: the old one is kept beside it.
 
     The exit code is 3 if a camera has turned or moved beyond chance, relocked or not; 0 if none has; 1 if that could
-    not be measured.
+    not be measured, or if a camera that moved is to be relocked.
 
     **Examples**
 

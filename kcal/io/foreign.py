@@ -35,7 +35,7 @@ _ROUNDED = 1e-4
 # Of a file of cameras: ten thousand frames of nerfstudio have 10 MiB.
 MOST_BYTES = 32 * 2**20
 # Meters that no rig has, and what no coefficient of a lens comes near.
-_MOST_METERS, _MOST_COEFFICIENT = 1e6, 1e15
+_LEAST_METERS, _MOST_METERS, _MOST_COEFFICIENT = 1e-9, 1e6, 1e15
 
 
 class Hints(NamedTuple):
@@ -75,8 +75,19 @@ class ImportedCameras:
         return self.poses[1].after(self.poses[0].inverse())
 
     def is_rig(self) -> bool:
-        """Whether these are two cameras at different places."""
-        return len(self.cameras) == 2 and len(self.poses) == 2 and float(self._second_from_first.translation.norm()) > 0
+        """Whether these are two cameras at different places.
+
+        Raises:
+            InputError: two at one place, but for rounding.
+        """
+        if not len(self.cameras) == len(self.poses) == 2:
+            return False
+        apart = float(self._second_from_first.translation.norm())
+        if 0 < apart < _LEAST_METERS:
+            raise InputError(
+                f"{' and '.join(self.names)} stand in one place: by their poses they are {apart:.1g} m apart"
+            )
+        return apart > 0
 
     def rig(self) -> Rig:
         """Both cameras as a rig, the first one on the left.
@@ -265,15 +276,21 @@ def whole_size(width: Any, height: Any) -> tuple[int, int]:
 BEFORE = re.compile(r"(left|right|(?:cam(?:era)?)?[0-9]{1,3})(.+)")
 # Keys of other things than a lens, and keys of a lens.
 OTHER = re.compile(
-    "err|rms|resid|uncert|^std|std$|sigma|view|object|(?<!principal)point|corner|board|square|pattern|marker|target|grid|time"
+    "err|(?<!pa)rms|resid|uncert|^std|std$|sigma|view|object|(?<!principal)point|corner|board|square|pattern|marker|target|grid|time"
     "|date$|stamp|flag|extrin|pose|rotat|translat|rvec|tvec|quat|orient|posit|world|valid|^new|optimal|undist|rectif|^proj"
-    "|essential|fundamental|fps|rate|name|path|file|version|count|^num|comment|note|desc|serial|id$|header|frame|gain|mm$|ext[rt]$|^estim"
-    "|expos|aspect|bias|noise|gyro|acc|imu|body|base(?:line)?$|overlap|resolutions|transform|aabb|scene|bound|render|^(?:[rp][12]?|[qef]|om|h[12]|t[0-9a-z]{0,4})$"
+    "|essential|fundamental|fps|rate(?!d)|name|path|file|version|count|^num|comment|note|desc|serial|id$|header|frame|gain|lidar|mm$|ext[rt]$|^estim"
+    "|expos|aspect|bias|noise|gyro|acc|imu|body|base(?:line)?$|overlap|resolutions|transform|aabb|scene|bound|render|^(?:[rp][12]?|[qef]|om|h[12]|t(?!ang?$|au|ilt)[0-9a-z]{0,4})$"
 )
 _LENS = re.compile(
-    "distor|dist[kp]?[0-9]|^dist(?!ance)|coef|lens|^[dk][0-9]|^[prt][0-9]|^s[1-4]$|tau|xi$|alpha|beta|gamma|model|skew|binn|roi|tang|radial|fisheye|omni|mirror"
+    "distor|dist[kp]?[0-9]|^dist(?!ance)|coef|lens|^[dk][0-9]|^[prt][0-9]|^s[1-4]$|tau|xi$|alpha|beta|gamma|model|skew|binn|roi|tang?$|tang|tilt|radial|fisheye|omni|mirror"
     "|intrins|matrix|focal|princip|cent(?:er|re)|^[fc][xyuv]$|mapping|stretch|poly|affin|equi|^[dfk]$"
 )
+# What no part of a name makes another thing than a lens, unless it says of what else: an error, a switch, a count.
+_COEFFICIENTS = re.compile(
+    "^(?!.*(err|(?<!pa)rms|resid|uncert|std|sigma|dev|view|valid|optimal|rectif|undist(?!.*coef)|flag|num|count|version|stamp))"
+    ".*(distor|dist[a-z]*(coef|par)|coef)"
+)
+_KNOWN = re.compile("(?:matrix|mtx)|dist(?:ortion)?(?:coef+s|coef+icients)|k[1-6]|p[12]")
 _MOST_NAMED = 12
 
 
@@ -282,10 +299,23 @@ def bare(key: object) -> str:
     return re.sub("[^a-z0-9]", "", str(key).lower())
 
 
+def _words(text: str) -> list[str]:
+    """Numbers of a text such as "[1.5, -2 3]", as words; none where commas may be those of decimals."""
+    inner = text.translate({ord(bracket): " " for bracket in "[](){};"}).strip()
+    words = inner.split() if re.search(r"\s", inner) else inner.split(",")
+    words = [word.removesuffix(",") for word in words]
+    return words if all(re.fullmatch(r"[-+]?[.\d][.\deE+-]*", word) for word in words) else []
+
+
 def flat(value: Any) -> list[float] | None:
-    """All numbers of a scalar, of nested lists, of an array or of a block with `data`; None for anything else."""
+    """All numbers of a scalar, of nested lists, of an array, of a text or of a block with `data`; None otherwise."""
     if isinstance(value, Mapping):
+        counted = [str(key) for key in value] == list(map(str, range(len(value))))
+        if counted and value and not any(isinstance(part, Mapping | list | tuple) for part in value.values()):
+            return flat([*value.values()])
         return flat(value["data"]) if "data" in value else None
+    if isinstance(value, str) and len(words := _words(value)) > 1:
+        value = words
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         # At once: maps for cv2.remap have millions.
         return None if value.dtype == bool else list(value.astype(float).ravel().tolist())
@@ -330,14 +360,30 @@ class Keys(UserDict[str, Any]):
                 found = flat([part for part in value if flat(part)])
             if isinstance(value, Mapping) and found is None and not OTHER.search(name):
                 yield from Keys(value)._unread(f"{where}{key}.")
+            text = value if isinstance(value, str) else ""
+            if (
+                not found
+                and _LENS.search(name)
+                and re.search("[0-9]", text)
+                and not re.search("[a-df-z/:]", text, re.I)
+            ):
+                raise ValueError(f"{where}{key} ({text}) must be numbers with decimal points")
             if not found or not any(found):
                 continue
-            if OTHER.search(name) and not (len(found) == 1 and re.fullmatch("[prt][12]|f", name)):
+            if (
+                OTHER.search(name)
+                and not _COEFFICIENTS.search(name)
+                and not (len(found) == 1 and re.fullmatch("[prt][12]|f", name))
+            ):
                 continue
             if _LENS.search(name) or 4 <= len(found) <= 14:
                 if whole is None:
                     raise ValueError(f"{where}{key} must be numbers")
                 shape = f"{len(found)} numbers" if len(found) > 1 else f"{found[0]:g}"
+                if _KNOWN.fullmatch(name):
+                    raise ValueError(
+                        f"{where}{key} has {shape}, and cannot have so many: decimals need a point, a matrix is 3 x 3"
+                    )
                 raise ValueError(
                     f"{where}{key} ({shape}) may describe the lens, and kcal does not know this name; rename it as the "
                     "format has it (camera_matrix, distortion_coefficients, ...), or delete it if it is no lens's"

@@ -250,7 +250,7 @@ _READERS: dict[str, tuple[str, Callable[[str, Path, Hints], Found]]] = {
     "RealSense": (r'^[ \t]*Intrinsic of "', _enumerated),
     "ZED": (r"^\[LEFT_CAM_\w+\]", _zed),
     "EuRoC": (r"^T_BS\s*:", _euroc),
-    "KITTI": (r"^(?:P0|P_rect_0\d|K_0\d):", _kitti),
+    "KITTI": (r"^(?:P0|P_rect_0\d|K_0\d):\s*[-\d]", _kitti),
     # The second and third number are zero in a matrix that is written column by column.
     "Open3D": (r'"PinholeCamera(?:Parameters|Traj)|"intrinsic_matrix"\s*:\s*\[[^,\[\]]+(?:,\s*0(?:\.0*)?\s*){2},',
                _open3d),

@@ -26,6 +26,10 @@ _GEOMETRIES = {"DistortedPinholeCamera": "opencv4", "EquidistantDistortedPinhole
 _RESULTS = re.compile(r"^[ \t]*(distortion|projection): \[([^\]\n]*)\] \+- \[([^\]\n]*)\]", re.MULTILINE)
 
 
+# Elements of two poses that are one, m: Kalibr fits each to the other, and files round.
+_SAME_POSE = 1e-3
+
+
 def read_kalibr(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
     """Read all cameras of a chain, with poses from the first camera's frame; or of a `results-cam.txt`, with σ."""
     text = read_text(path, MOST_YAML)
@@ -47,6 +51,10 @@ def read_kalibr(path: Path, hints: foreign.Hints) -> foreign.ImportedCameras:
             first = imu if not i else first
         if "T_cn_cnm1" in part:
             whole = _transform(part, "T_cn_cnm1", name) @ whole
+            by_imu = None if imu is None or first is None else imu @ np.linalg.inv(first)
+            if i and by_imu is not None and np.abs(by_imu - whole).max() > _SAME_POSE:
+                raise ValueError(f"{name}: T_cn_cnm1 and T_cam_imu are both there and differ by up to "
+                                 f"{np.abs(by_imu - whole).max():.2g}; delete the one that is wrong")  # fmt: skip
         elif i and imu is not None and first is not None:
             whole = imu @ np.linalg.inv(first)
         elif i:

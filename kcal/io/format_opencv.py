@@ -126,7 +126,8 @@ def ros_camera(content: Mapping[str, Any], name: str, hints: Hints) -> ImportedC
         flat(content.get(long, content.get(short, content.get(short.lower()))))
         for long, short in (("rectification_matrix", "R"), ("projection_matrix", "P"))
     )
-    if not turn or not projected or len(found.cameras) != 1:
+    # Zeros are what a message has before anybody fills it in.
+    if not any(turn or ()) or not any(projected or ()) or len(found.cameras) != 1:
         return found
     rotation = np.array(numbers(turn, 9, "rectification_matrix")).reshape(3, 3)
     projection = np.array(numbers(projected, 12, "projection_matrix")).reshape(3, 4)

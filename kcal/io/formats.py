@@ -251,6 +251,12 @@ _JSON = {
 }  # fmt: skip
 
 
+# Formats whose lengths are meters unless a user, who knows what wrote them, says otherwise, how far apart their cameras
+# rarely are, and formats without a unit.
+_OF_METERS, _FAR = ("ros", "bag", "kalibr", "basalt", "mrcal", "multical"), 10.0
+_OF_UNITS = ("opencv", "toml", "matlab", "colmap", "calibio")
+
+
 def import_cameras(
     *paths: str | Path,
     format: str | None = None,
@@ -299,6 +305,10 @@ def import_cameras(
         raise InputError(f"{paths[0]}: the pose of a pair without its cameras; name the file of the cameras too")
     notes = [*itertools.chain.from_iterable(part.notes for part in parts)]
     notes += [f"camera {name} cannot be read: {reason}" for name, reason in unread.items()]
+    if meters is None and len(poses) == len(cameras) and {part.format for part in parts} <= {*_OF_METERS}:
+        centers = torch.stack([pose.inverse().translation for pose in poses])
+        if (apart := float(torch.cdist(centers, centers).max())) > _FAR:
+            notes.append(f"cameras are {apart:.4g} m apart, as the format has meters (--unit mm for millimeters)")
     foreign = [camera for part in parts if part.format != "kcal" for camera in part.cameras]
     notes += [f"{camera_name(camera, 'camera')}: {text}" for camera in foreign if (text := _doubt(camera, paths[0]))]
     return ImportedCameras(
@@ -329,7 +339,14 @@ def _imported(path: Path, name: str | None, hints: Hints) -> ImportedCameras:
     name = name or recognized(path)
     if name != "kcal":
         with reading(path, name):
-            return FORMATS[name].read(path, hints)
+            found = FORMATS[name].read(path, hints)
+        if hints.meters is None or not found.poses or name in _OF_UNITS:
+            return found
+        if name not in _OF_METERS:
+            raise InputError(f"{path}: the unit is in files of this format ({found.format}): leave --unit out")
+        return dataclasses.replace(
+            found, poses=tuple(Pose(pose.rotation, hints.meters * pose.translation) for pose in found.poses)
+        )
     with reading(path, "kcal"):
         kind = read_json(read_text(path, MOST_JSON).encode(), str(path))["kcal"]
     if kind == "rig":

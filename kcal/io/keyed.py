@@ -41,7 +41,7 @@ _ROLES: dict[str, tuple[str, Sequence[int]]] = {
     # As OpenCV's interactive calibration has them.
     "matrix_sigmas": (f"{_MATRIX}{_DEVIATIONS}", (4,)),
     "lens_sigmas": (f"{_LENS}{_DEVIATIONS}", range(4, 15)),
-    "rotation": ("(?:stereo)?(?:r|rot(?:ation)?(?:matrix|mat|vector|vec)?|rmat)", (3, 9)),
+    "rotation": ("(?:stereo)?(?:r|rot(?:ation)?(?:matrix|mat|vector|vec)?|rmat|rvec)", (3, 9)),
     "translation": ("(?:stereo)?(?:t|trans(?:lation)?(?:vector|vec)?|tvec)", (3,)),
     # ORB-SLAM3's first camera from the second, OKVIS's body from a camera, and MC-Calib's first camera from one.
     "second": ("(?:stereo)?tc1c2|tlr", (12, 16)),
@@ -86,7 +86,7 @@ def _role(key: str, value: Any) -> tuple[str, str] | None:
     for base, side in ways:
         for role, pattern in _PATTERNS.items():
             # A distance is one number; no list of coefficients is.
-            if base and count in _ROLES[role][1] and pattern.fullmatch(base) and (role != "lens" or many):
+            if base and count in _ROLES[role][1] and pattern.fullmatch(base) and (role != "lens" or many or count > 1):
                 return role, re.sub("cam(?:era)?|(?<=[lr])(?:eft|ight)", "", side or "")
     return None
 
@@ -163,7 +163,7 @@ class _Named:
             if where not in ("", side) or role.split()[0] not in ("kind", "fisheye"):
                 continue
             value = self.keys[key]
-            text = re.sub("^(?:(?:rs2)?distortion|lensmodel)", "", foreign.bare(value))
+            text = re.sub("^(?:(?:rs2)?distortion|lensmodel)|(?<=.)camera$", "", foreign.bare(value))
             if role == "fisheye":
                 said[value not in (0, "0", "no", "No") and text not in ("false", "00")] = key
             elif text in _REALSENSE and bent and fisheye is None:
@@ -304,6 +304,8 @@ def _flattened(content: Mapping[str, Any]) -> dict[str, Any]:
         if twice := [one for one in inner if one in found and str(found[one]) != str(inner[one])]:
             raise ValueError(f"{min(twice)} is there twice, in {key} and elsewhere; kcal cannot tell which is meant")
         found |= inner
+    if len(foreign.flat(found.get("cameraExtrinsics")) or []) in (5, 8) and "cameraIntrinsics" in found:
+        found["distCoeffs"] = found.pop("cameraExtrinsics")  # as PhotonVision called it until 2023
     if "mu" in found and "k5" in found:
         # camodocal counts the coefficients of its fisheye from k2.
         found = {f"k{int(key[1]) - 1}" if re.fullmatch("k[2-5]", key) else key: value for key, value in found.items()}
@@ -347,6 +349,13 @@ def _camera(
             raise ValueError(f"{key} may be k1 k2 p1 p2, or k1 to k4 of a fisheye, and {why}: say --fisheye or "
                              "--no-fisheye")  # fmt: skip
         notes.append("4 coefficients read as k1 k2 p1 p2; if they are a fisheye's, use --fisheye")
+    if (
+        fisheye is None
+        and ("k4", side) in named.at
+        and not any((one, side) in named.at for one in ("p1", "p2", "k5", "k6"))
+    ):
+        raise ValueError("k1 to k4 without p1 and p2 may be a fisheye's, or those of a rational lens: say --fisheye or "
+                         "--no-fisheye")  # fmt: skip
     if not lens:
         notes.append(f"{name}: no coefficients of a lens in the file; read as one without distortion")
     if skew and not fisheye:
@@ -458,6 +467,9 @@ def _pose_of_keys(named: _Named, side: str, meters: float) -> Pose:
     if named.get("body", side) is not None:
         return _inverse_of(named, "body", side, meters)
     turn = foreign.numbers(named.get("rotation", side), (3, 9), named.key("rotation", side))
+    if len(turn) == 3 and (angle := math.hypot(*turn)) > 2.0 * math.pi:
+        raise ValueError(f"{named.key('rotation', side)} is a turn by {angle:.4g} rad, more than a whole one: is it in "
+                         "degrees? Radians are needed")  # fmt: skip
     rotation = foreign.plain(rotation_from_vector(torch.tensor(turn, dtype=torch.float64))) if len(turn) == 3 else turn
     shift = foreign.numbers(named.get("translation", side), 3, named.key("translation", side))
     return foreign.checked_pose(rotation, [meters * value for value in shift])

@@ -5,6 +5,7 @@ What is right is computed by OpenCV or by the lens's own formula, and compared a
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import json
 import math
@@ -21,9 +22,10 @@ from command_line import Command
 from numpy.typing import NDArray
 from scipy.io import savemat
 
-from kcal.errors import FileError
+from kcal.errors import FileError, InputError
 from kcal.io.formats import import_cameras
 from kcal.io.rig_file import RigFile
+from kcal.lens.pose import Pose
 
 K = np.array([[500.0, 0, 330], [0, 505, 236], [0, 0, 1]])
 D = [-0.2, 0.05, 0.001, -0.002, 0.01]
@@ -159,6 +161,34 @@ READ: dict[str, tuple[str, Any, Pixels]] = {
         f"TOML {key}": ("a.toml", TOML.format(M, key, D), plain())
         for key in ("distortions", "dist_coeffs", "distortion_coeffs")
     },
+    # As PhotonVision wrote it until 2023, and coefficients as text or counted.
+    "PhotonVision": (
+        "a.json",
+        {
+            "resolution": {"width": 640, "height": 480},
+            "cameraIntrinsics": {"rows": 3, "cols": 3, "data": M},
+            "cameraExtrinsics": {"rows": 1, "cols": 5, "data": D},
+        },
+        plain(),
+    ),
+    **{
+        f"text {text}": ("a.json", SIZE | {"K": M, "dist_coeffs": text}, plain())
+        for text in (
+            str(D),
+            str(np.array(D)),
+            str([D]),
+            " ".join(map(str, D)),
+            ",".join(map(str, D)),
+            ";".join(map(str, D)),
+        )
+    },
+    "counted": ("a.json", SIZE | {"K": M, "distCoeffs": {str(k): value for k, value in enumerate(D)}}, plain()),
+    "MRPT": ("a.ini", f"[CAMERA]\nresolution=[640 480]\nfx=500\nfy=505\ncx=330\ncy=236\ndist={np.array(D)}\n", plain()),
+    "ROS, not rectified": (
+        "a.yaml",
+        ros("distortion_model: plumb_bob") + f"rectification_matrix: {[0.0] * 9}\nprojection_matrix: {[0.0] * 12}\n",
+        plain(),
+    ),
     "nested": ("a.json", {"camera": {"K": M, "D": D, "width": 640, "height": 480}}, plain()),
     "named numbers": (
         "a.json",
@@ -393,6 +423,36 @@ REFUSED: dict[str, tuple[str, Any, str]] = {
     "no camera in text": ("notes.txt", "camera number four\nlens cap lost\n", "not a camera file that kcal knows"),
     "COLMAP's panorama": ("cameras.txt", PANORAMA, "camera model EQUIRECTANGULAR"),
     "cut gzip": ("a.yml.gz", gzip.compress(opencv("K", "D").encode())[:-20], "cut short"),
+    # Parts of a name that mean other things elsewhere.
+    **{
+        key: ("a.json", SIZE | {"K": M, key: D}, f"{key} .5 numbers. may describe the lens")
+        for key in (
+            "calibrated_distortion",
+            "generated_dist",
+            "dist_parms",
+            "lens_profile_coeffs",
+            "pointgrey_distortion",
+            "distortion_world",
+            "undistort_coeffs",
+            "projection_distortion",
+            "estimated_distortion",
+        )
+    },
+    "tilt": ("a.json", SIZE | NUMBERS | {"tau_x": 0.02}, "tau_x .0.02. may describe"),
+    "tang": ("a.json", SIZE | NUMBERS | {"tang": [0.1, 0.2]}, "tang .2 numbers. may describe"),
+    "decimal commas": (
+        "a.json",
+        SIZE | {"K": M, "D": "-0,26 0,04 0,001 0,002"},
+        "D .*must be numbers with decimal points",
+    ),
+    "a decimal comma": ("a.json", SIZE | NUMBERS | {"k1": "-0,26"}, "k1 has 2 numbers, and cannot have so many"),
+    "a matrix of commas": ("a.json", SIZE | {"camera_matrix": [1] * 11, "D": D}, "camera_matrix has 11 numbers, and"),
+    "a fisheye by name": (
+        "a.json",
+        SIZE | dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"), [*C, *F], strict=True)),
+        "may be a fisheye's, or those of a rational lens: say --fisheye",
+    ),
+    "degrees": ("a.json", TWO | {"K": M, "D": D, "M2": M, "D2": D, "R": [0.3, -42.5, 1.2]}, "42.52 rad.* degrees"),
     "no size": ("a.json", {"K": M, "D": D}, "image size is not in the file"),
 }
 
@@ -477,6 +537,45 @@ def test_cameras_beside_an_imu_are_a_rig(tmp_path: Path, imu: str) -> None:
     rig = import_cameras(written(tmp_path, "c.yaml", text)).rig()
     assert np.abs(rig.right_from_left_translation.numpy() - [-0.11, 0, 0]).max() < 1e-12
     assert np.abs(rig.right_from_left_rotation.numpy() - np.eye(3)).max() < 1e-12
+
+
+def test_poses_that_are_stated_twice_agree(tmp_path: Path) -> None:
+    """Kalibr's chain, and each camera's place by the IMU."""
+    second = np.eye(4)
+    second[0, 3] = -0.11
+    for wrong in (False, True):
+        chain = np.linalg.inv(second) if wrong else second
+        text = "".join(
+            kalibr("pinhole", "radtan", [], D[:4], f"  T_cam_imu: {place.tolist()}\n{more}").replace("cam0", f"cam{i}")
+            for i, (place, more) in enumerate(((np.eye(4), ""), (second, f"  T_cn_cnm1: {chain.tolist()}\n")))
+        )
+        path = written(tmp_path, "c.yaml", text)
+        if wrong:
+            with pytest.raises(FileError, match=r"T_cn_cnm1 and T_cam_imu are both there and differ by up to 0\.22"):
+                import_cameras(path)
+        else:
+            assert float(import_cameras(path).rig().baseline) == pytest.approx(0.11)
+
+
+@pytest.mark.parametrize(("stated", "unit", "meters"), [(120.0, None, 120.0), (120.0, 1e-3, 0.12), (0.12, None, 0.12)])
+def test_the_unit_counts_for_formats_that_have_meters(
+    tmp_path: Path, stated: float, unit: float | None, meters: float
+) -> None:
+    paths = []
+    for side, beside in (("left", 0.0), ("right", -500.0 * stated)):
+        more = f"rectification_matrix: {np.eye(3).ravel().tolist()}\n"
+        more += f"projection_matrix: [500, 0, 330, {beside}, 0, 505, 236, 0, 0, 0, 1, 0]\n"
+        paths.append(written(tmp_path, f"{side}.yaml", ros("distortion_model: plumb_bob") + more))
+    found = import_cameras(*paths, meters=unit)
+    assert float(found.rig().baseline) == pytest.approx(meters)
+    assert any("120 m apart, as the format has meters" in note for note in found.notes) is (meters > 10)
+    same = import_cameras(paths[1], paths[1])
+    same = dataclasses.replace(same, poses=(same.poses[0], Pose(same.poses[0][0], same.poses[0][1] + 1e-15)))
+    with pytest.raises(InputError, match="stand in one place"):
+        same.rig()
+    zed = written(tmp_path, "SN1.conf", "[LEFT_CAM_HD]\nfx=500\n")
+    with pytest.raises(FileError):
+        import_cameras(zed, meters=1e-3)
 
 
 def test_three_cameras_are_a_rig(tmp_path: Path, command: Command) -> None:
