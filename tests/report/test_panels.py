@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -74,3 +75,13 @@ def test_names_are_no_mathematics_in_figures_of_the_caller() -> None:
 
 def test_a_figure_is_a_picture_in_a_notebook() -> None:
     assert board_figure(drawn_scenes.bent())._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
+
+
+def test_a_bearing_goes_from_its_tower_towards_what_it_saw() -> None:
+    """The light, 800 m west and 2.5 km north of the mill, as far as it is drawn."""
+    figure = stations_figure(drawn_scenes.stations())
+    (bearing,) = (line for line in figure.axes[0].lines if line.get_linestyle() == "--")
+    east, north = bearing.get_xydata().T  # type: ignore[union-attr]
+    assert (east[0], north[0]) == pytest.approx((0.0, 0.0), abs=1e-9)
+    assert math.degrees(math.atan2(east[1], north[1])) == pytest.approx(math.degrees(math.atan2(-0.8, 2.5)), abs=0.01)
+    plt.close(figure)
