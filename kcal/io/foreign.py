@@ -282,15 +282,15 @@ OTHER = re.compile(
     "|expos|aspect|bias|noise|gyro|acc|imu|body|base(?:line)?$|overlap|resolutions|transform|aabb|scene|bound|render|^(?:[rp][12]?|[qef]|om|h[12]|t(?!ang?$|au|ilt)[0-9a-z]{0,4})$"
 )
 _LENS = re.compile(
-    "distor|dist[kp]?[0-9]|^dist(?!ance)|coef|lens|^[dk][0-9]|^[prt][0-9]|^s[1-4]$|tau|xi$|alpha|beta|gamma|model|skew|binn|roi|tang?$|tang|tilt|radial|fisheye|omni|mirror"
+    "distor|dist[kp]?[0-9]|^dist(?!ance)|coef|lens|^[dk][0-9]|^[prt][0-9]|^s[1-4]$|tau|xi$|alpha|beta|gamma|model|skew|binn|roi|tan$|tang|tilt|radial|fisheye|omni|mirror"
     "|intrins|matrix|focal|princip|cent(?:er|re)|^[fc][xyuv]$|mapping|stretch|poly|affin|equi|^[dfk]$"
 )
 # What no part of a name makes another thing than a lens, unless it says of what else: an error, a switch, a count.
-_COEFFICIENTS = re.compile(
+_ITS_COEFFICIENTS = re.compile(
     "^(?!.*(err|(?<!pa)rms|resid|uncert|std|sigma|dev|view|valid|optimal|rectif|undist(?!.*coef)|flag|num|count|version|stamp))"
     ".*(distor|dist[a-z]*(coef|par)|coef)"
 )
-_KNOWN = re.compile("(?:matrix|mtx)|dist(?:ortion)?(?:coef+s|coef+icients)|k[1-6]|p[12]")
+_SHAPED = re.compile("(?:matrix|mtx)|dist(?:ortion)?(?:coef+s|coef+icients)|k[1-6]|p[12]")
 _MOST_NAMED = 12
 
 
@@ -361,18 +361,13 @@ class Keys(UserDict[str, Any]):
             if isinstance(value, Mapping) and found is None and not OTHER.search(name):
                 yield from Keys(value)._unread(f"{where}{key}.")
             text = value if isinstance(value, str) else ""
-            if (
-                not found
-                and _LENS.search(name)
-                and re.search("[0-9]", text)
-                and not re.search("[a-df-z/:]", text, re.I)
-            ):
+            if not found and _LENS.search(name) and re.fullmatch("(?i)[^a-df-z/:]*[0-9][^a-df-z/:]*", text):
                 raise ValueError(f"{where}{key} ({text}) must be numbers with decimal points")
             if not found or not any(found):
                 continue
             if (
                 OTHER.search(name)
-                and not _COEFFICIENTS.search(name)
+                and not _ITS_COEFFICIENTS.search(name)
                 and not (len(found) == 1 and re.fullmatch("[prt][12]|f", name))
             ):
                 continue
@@ -380,7 +375,7 @@ class Keys(UserDict[str, Any]):
                 if whole is None:
                     raise ValueError(f"{where}{key} must be numbers")
                 shape = f"{len(found)} numbers" if len(found) > 1 else f"{found[0]:g}"
-                if _KNOWN.fullmatch(name):
+                if _SHAPED.fullmatch(name):
                     raise ValueError(
                         f"{where}{key} has {shape}, and cannot have so many: decimals need a point, a matrix is 3 x 3"
                     )

@@ -305,7 +305,7 @@ def _flattened(content: Mapping[str, Any]) -> dict[str, Any]:
             raise ValueError(f"{min(twice)} is there twice, in {key} and elsewhere; kcal cannot tell which is meant")
         found |= inner
     if len(foreign.flat(found.get("cameraExtrinsics")) or []) in (5, 8) and "cameraIntrinsics" in found:
-        found["distCoeffs"] = found.pop("cameraExtrinsics")  # as PhotonVision called it until 2023
+        found["distCoeffs"] = found.pop("cameraExtrinsics")  # as older files of PhotonVision call it
     if "mu" in found and "k5" in found:
         # camodocal counts the coefficients of its fisheye from k2.
         found = {f"k{int(key[1]) - 1}" if re.fullmatch("k[2-5]", key) else key: value for key, value in found.items()}

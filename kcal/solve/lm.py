@@ -268,14 +268,14 @@ def attach_implicit_gradient(
         r = residual(x, *element)
         return 0.5 * (r * r).sum()
 
-    lead, at = solution.ndim - 1, (solution, *data)
+    at = solution, *data
     if not known_true(converged):
         # What is not finite would make derivatives by what elements share so, although it counts zero: one that
         # converged stands in.
         one = converged.reshape(-1).to(torch.int8).argmax().reshape(1)
         at = tuple(_where(converged, value, one) for value in at)
     gradient, hessian = torch.func.grad(cost), torch.func.hessian(cost)
-    for _ in range(lead):
+    for _ in range(solution.ndim - 1):
         gradient, hessian = torch.func.vmap(gradient), torch.func.vmap(hessian)
     with torch.no_grad():
         inverse = torch.linalg.pinv(hessian(*at), hermitian=True)

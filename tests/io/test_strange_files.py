@@ -161,7 +161,7 @@ READ: dict[str, tuple[str, Any, Pixels]] = {
         f"TOML {key}": ("a.toml", TOML.format(M, key, D), plain())
         for key in ("distortions", "dist_coeffs", "distortion_coeffs")
     },
-    # As PhotonVision wrote it until 2023, and coefficients as text or counted.
+    # As older files of PhotonVision have them, and coefficients as text or counted.
     "PhotonVision": (
         "a.json",
         {
