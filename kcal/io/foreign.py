@@ -299,7 +299,7 @@ def bare(key: object) -> str:
     return re.sub("[^a-z0-9]", "", str(key).lower())
 
 
-def _words(text: str) -> list[str]:
+def _number_words(text: str) -> list[str]:
     """Numbers of a text such as "[1.5, -2 3]", as words; none where commas may be those of decimals."""
     inner = text.translate({ord(bracket): " " for bracket in "[](){};"}).strip()
     words = inner.split() if re.search(r"\s", inner) else inner.split(",")
@@ -314,7 +314,7 @@ def flat(value: Any) -> list[float] | None:
         if counted and value and not any(isinstance(part, Mapping | list | tuple) for part in value.values()):
             return flat([*value.values()])
         return flat(value["data"]) if "data" in value else None
-    if isinstance(value, str) and len(words := _words(value)) > 1:
+    if isinstance(value, str) and len(words := _number_words(value)) > 1:
         value = words
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         # At once: maps for cv2.remap have millions.
