@@ -179,8 +179,8 @@ def _over_limit_behind(solution: RigSolution) -> Tensor:
 def without_behind(work: Adjustment, mask: Tensor, kept: Tensor, solver: LMOptions) -> tuple[Tensor, Tensor]:
     """Leave out features behind the cameras as well: nothing is there, and a wrong match on its line has no residual.
 
-    The worst is left out first, because it may put others behind. Most of them are behind where left and right are
-    swapped, which `swap_findings` tells.
+    The worst is left out first, because it may put others behind; of thousands, the worst thousandth. Most of them are
+    behind where left and right are swapped, which `swap_findings` tells.
 
     Args:
         work: at the solution of what was kept.
@@ -196,7 +196,8 @@ def without_behind(work: Adjustment, mask: Tensor, kept: Tensor, solver: LMOptio
         over = _over_limit_behind(RigSolution(work.problem(kept), work.part(kept)))
         if not 0 < int((over > 1.0).sum()) <= len(over) / 2:
             break
-        worst, before = at.start + kept[at].nonzero()[over.nan_to_num(0.0).argmax(), 0], work.state
+        most, which = over.nan_to_num(0.0).topk(1 + len(over) // 1000)
+        worst, before = at.start + kept[at].nonzero()[which[most > 1.0], 0], work.state
         behind[worst] = True
         try:
             kept = explained(work, mask & ~behind, solver)
