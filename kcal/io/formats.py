@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 
@@ -43,6 +43,7 @@ class CameraFormat(NamedTuple):
         prior: whether it is a file of priors, which has the parameters and their square-root information.
         lenses: lenses of `kcal.io.foreign_lenses.LENSES` that it can hold as well.
         wide: whether these are chosen unasked where kcal's models are far off.
+        unit: of its lengths: meters, unless a user who knows what wrote a file says otherwise; open; or stated in it.
     """
 
     name: str
@@ -55,6 +56,7 @@ class CameraFormat(NamedTuple):
     prior: bool = False
     lenses: tuple[str, ...] = ()
     wide: bool = False
+    unit: Literal["meters", "open", "stated"] = "stated"
 
     @property
     def read(self) -> Callable[[Path, Hints], ImportedCameras]:
@@ -80,23 +82,26 @@ _KALIBR, _MRCAL = tuple(format_kalibr.KALIBR_LENSES), ("pinhole", "opencv4", "op
 _DEVICES = "depthai, Azure Kinect, RealSense, ZED, EuRoC, KITTI, Open3D, nuScenes, photos of DJI's drones"
 _LIST = (
     CameraFormat(
-        "opencv", format_opencv, "OpenCV YAML, XML or JSON, one camera or a pair", _OPENCV, (".yml", ".yaml", ".xml"), 2
+        "opencv", format_opencv, "OpenCV YAML, XML or JSON, one camera or a pair", _OPENCV, (".yml", ".yaml", ".xml"),
+        2, unit="open",
     ),
-    CameraFormat("ros", format_opencv, "ROS camera_info, a file per camera", _ROS, poses=2),
-    CameraFormat("bag", format_bag, "ROS bag with camera_info and tf", _ROS, format_bag.SUFFIXES, _ANY),
+    CameraFormat("ros", format_opencv, "ROS camera_info, a file per camera", _ROS, poses=2, unit="meters"),
+    CameraFormat("bag", format_bag, "ROS bag with camera_info and tf", _ROS, format_bag.SUFFIXES, _ANY, unit="meters"),
     CameraFormat(
         "kalibr", format_kalibr, "Kalibr camchain", ("pinhole", "opencv4", "fisheye4"), poses=_ANY, lenses=_KALIBR,
-        wide=True,
+        wide=True, unit="meters",
     ),
     CameraFormat(
         "basalt", format_kalibr, "Basalt calibration.json", ("pinhole", "opencv8", "fisheye4"), poses=_ANY,
-        lenses=("ds", "eucm", "fov"), wide=True,
+        lenses=("ds", "eucm", "fov"), wide=True, unit="meters",
     ),
-    CameraFormat("mrcal", format_mrcal, "mrcal cameramodel, a file per camera", _MRCAL, (".cameramodel",), _ANY),
+    CameraFormat(
+        "mrcal", format_mrcal, "mrcal cameramodel, a file per camera", _MRCAL, (".cameramodel",), _ANY, unit="meters"
+    ),
     CameraFormat(
         "colmap", format_photos, "COLMAP cameras.txt or cameras.bin with its rigs, or database",
         ("pinhole", "opencv4", "opencv8", "fisheye4"), (".txt", ".bin"), _ANY,
-        lenses=("rad-tan-thin-prism", "eucm", "fov", "division"),
+        lenses=("rad-tan-thin-prism", "eucm", "fov", "division"), unit="open",
     ),
     CameraFormat(
         "nerfstudio", format_photos, "nerfstudio transforms.json", ("pinhole", "opencv4", "opencv5", "fisheye4"),
@@ -104,15 +109,19 @@ _LIST = (
     ),
     CameraFormat(
         "matlab", format_opencv, "MATLAB struct of camera or stereo parameters", ("pinhole", "opencv4", "opencv5"),
-        (".mat",), 2, skew=True,
+        (".mat",), 2, skew=True, unit="open",
     ),
     CameraFormat(
         "opensfm", format_photos, "OpenSfM camera_models.json", ("pinhole", "opencv4", "opencv5", "fisheye4"),
         lenses=("fisheye624",),
     ),
-    CameraFormat("toml", format_opencv, "TOML of aniposelib, pose2sim and Caliscope; INI", _OPENCV, (".toml",), _ANY),
-    CameraFormat("multical", format_opencv, "multical calibration.json", tuple(OPENCV_MODELS.values()), poses=_ANY),
-    CameraFormat("calibio", format_opencv, "calib.io JSON"),
+    CameraFormat(
+        "toml", format_opencv, "TOML of aniposelib, pose2sim and Caliscope; INI", _OPENCV, (".toml",), _ANY, unit="open"
+    ),
+    CameraFormat(
+        "multical", format_opencv, "multical calibration.json", tuple(OPENCV_MODELS.values()), poses=_ANY, unit="meters"
+    ),
+    CameraFormat("calibio", format_opencv, "calib.io JSON", unit="open"),
     CameraFormat("qualisys", format_photos, "Qualisys .qca.txt"),
     CameraFormat("agisoft", format_photos, "Agisoft Metashape XML"),
     CameraFormat("device", format_devices, _DEVICES),
@@ -251,10 +260,8 @@ _JSON = {
 }  # fmt: skip
 
 
-# Formats whose lengths are meters unless a user, who knows what wrote them, says otherwise, how far apart their cameras
-# rarely are, and formats without a unit.
-_OF_METERS, _FAR = ("ros", "bag", "kalibr", "basalt", "mrcal", "multical"), 10.0
-_OF_UNITS = ("opencv", "toml", "matlab", "colmap", "calibio")
+# Meters that cameras of formats in meters are rarely apart.
+_FAR = 10.0
 
 
 def import_cameras(
@@ -305,7 +312,11 @@ def import_cameras(
         raise InputError(f"{paths[0]}: the pose of a pair without its cameras; name the file of the cameras too")
     notes = [*itertools.chain.from_iterable(part.notes for part in parts)]
     notes += [f"camera {name} cannot be read: {reason}" for name, reason in unread.items()]
-    if meters is None and len(poses) == len(cameras) and {part.format for part in parts} <= {*_OF_METERS}:
+    if (
+        meters is None
+        and len(poses) == len(cameras)
+        and all(part.format in FORMATS and FORMATS[part.format].unit == "meters" for part in parts)
+    ):
         centers = torch.stack([pose.inverse().translation for pose in poses])
         if (apart := float(torch.cdist(centers, centers).max())) > _FAR:
             notes.append(f"cameras are {apart:.4g} m apart, as the format has meters (--unit mm for millimeters)")
@@ -340,9 +351,9 @@ def _imported(path: Path, name: str | None, hints: Hints) -> ImportedCameras:
     if name != "kcal":
         with reading(path, name):
             found = FORMATS[name].read(path, hints)
-        if hints.meters is None or not found.poses or name in _OF_UNITS:
+        if hints.meters is None or not found.poses or FORMATS[name].unit == "open":
             return found
-        if name not in _OF_METERS:
+        if FORMATS[name].unit == "stated":
             raise InputError(f"{path}: the unit is in files of this format ({found.format}): leave --unit out")
         return dataclasses.replace(
             found, poses=tuple(Pose(pose.rotation, hints.meters * pose.translation) for pose in found.poses)

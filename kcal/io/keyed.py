@@ -350,7 +350,8 @@ def _camera(
                              "--no-fisheye")  # fmt: skip
         notes.append("4 coefficients read as k1 k2 p1 p2; if they are a fisheye's, use --fisheye")
     if (
-        fisheye is None
+        stated is None
+        and fisheye is None
         and ("k4", side) in named.at
         and not any((one, side) in named.at for one in ("p1", "p2", "k5", "k6"))
     ):

@@ -183,10 +183,7 @@ class PointLocator:
                 for row in found.misfit.tolist()
             ],
         }
-        reasons = _view_reasons(rig, found)
-        for i in (found.status == int(PositionStatus.BEARING_ONLY)).nonzero()[:, 0].tolist():
-            if self.buried and int(found.used[i].sum()) == 1:
-                reasons[i] = self.buried[int(found.used[i].int().argmax())] or reasons[i]
+        reasons = _view_reasons(rig, found, self.buried)
         return _as_columns(marks, found, reasons, self._numbers(own, []), extras)
 
     def _numbers(self, found: Localization, more: Sequence[Group]) -> NDArray[np.float64]:
@@ -291,11 +288,13 @@ def camera_list(rig: Rig, which: Sequence[bool]) -> str:
     return " ".join(name for name, one in zip(rig.names, which, strict=True) if one)
 
 
-def _view_reasons(rig: Rig, found: Localization) -> list[str]:
+def _view_reasons(rig: Rig, found: Localization, buried: Sequence[str]) -> list[str]:
     reasons = []
-    rows = zip(found.status.tolist(), found.bad.tolist(), found.misfit.tolist(), strict=True)
-    for status, bad, misfit in rows:
+    columns = found.status, found.bad, found.misfit, found.used
+    for status, bad, misfit, used in zip(*(column.tolist() for column in columns), strict=True):
         text = _VIEW_TEXTS.get(PositionStatus(status), "")
+        if buried and status == PositionStatus.BEARING_ONLY and sum(used) == 1:
+            text = buried[used.index(True)] or text
         if any(bad):
             worst = max(value for value, one in zip(misfit, bad, strict=True) if one)
             text = f"left out: the mark in {camera_list(rig, bad)} contradicts the others ({worst:.0f} sigma); {text}"

@@ -273,7 +273,10 @@ def attach_implicit_gradient(
         # What is not finite would make derivatives by what elements share so, although it counts zero: one that
         # converged stands in.
         one = converged.reshape(-1).to(torch.int8).argmax().reshape(1)
-        at = tuple(_where(converged, value, one) for value in at)
+        first = (value.detach().reshape(-1, *value.shape[converged.ndim :]).index_select(0, one)[0] for value in at)
+        at = blend(
+            converged, tuple(own.nan_to_num().expand_as(value) for own, value in zip(first, at, strict=True)), at
+        )
     gradient, hessian = torch.func.grad(cost), torch.func.hessian(cost)
     for _ in range(solution.ndim - 1):
         gradient, hessian = torch.func.vmap(gradient), torch.func.vmap(hessian)
@@ -282,12 +285,6 @@ def attach_implicit_gradient(
     step = -(inverse @ gradient(*at)[..., None])[..., 0]
     step = torch.where(converged[..., None], step, 0.0)
     return solution + (step - step.detach())
-
-
-def _where(mask: Tensor, value: Tensor, one: Tensor) -> Tensor:
-    """`value` (*mask.shape, ...), elsewhere a finite copy of the element of number `one` (1,)."""
-    each = value.detach().reshape(-1, *value.shape[mask.ndim :]).index_select(0, one)[0].nan_to_num()
-    return torch.where(mask.reshape(*mask.shape, *[1] * each.ndim), value, each)
 
 
 # Dense least squares for any residual function, batched, with Jacobians from `torch.func`.

@@ -311,10 +311,8 @@ def without_wrong(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
         work.fit_corners(kept)
         # Each item by the fall of χ² without it, which sees leverage, but against what is typical of the plain χ².
         over = work.over_limit(kept, work.deletions(kept))
-        # One at a time, because one bends the others' solution; of thousands the worst thousandth.
-        most, which = over.topk(min(len(over), 1 + int(kept.sum()) // 1000))
-        if bool((most > 1.0).any()):
-            kept[which[most > 1.0]] = False
+        if len(worst := next_out(over, int(kept.sum()))):
+            kept[worst] = False
             _refuse_many(work, kept, mask)
             continue
         # With the cameras held where they are now, try again what was left out.
@@ -327,6 +325,15 @@ def without_wrong(work: Adjustment, mask: Tensor, solver: LMOptions) -> Tensor:
         kept[list(again)] = True
         returned |= again
     return kept
+
+
+def next_out(over: Tensor, count: int) -> Tensor:
+    """Which items (V,), over their limit by so many times, to leave out next of `count` that take part.
+
+    One at a time, because it may have bent the solution against the others; of thousands the worst thousandth.
+    """
+    most, which = over.nan_to_num(0.0).topk(min(len(over), 1 + count // 1000))
+    return which[most > 1.0]
 
 
 def possible(work: Adjustment, mask: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcal.calibrate.rig.adjustment import LOSS, MOST_WRONG, ROUGHLY, Adjustment, without_wrong
+from kcal.calibrate.rig.adjustment import LOSS, MOST_WRONG, ROUGHLY, Adjustment, next_out, without_wrong
 from kcal.calibrate.rig.contradictions import parts_of
 from kcal.calibrate.rig.marks import FeatureBlock
 from kcal.calibrate.rig.problem import GoodnessOfFit, RigProblem, RigSolution, goodness_of_fit, least
@@ -196,8 +196,7 @@ def without_behind(work: Adjustment, mask: Tensor, kept: Tensor, solver: LMOptio
         over = _over_limit_behind(RigSolution(work.problem(kept), work.part(kept)))
         if not 0 < int((over > 1.0).sum()) <= len(over) / 2:
             break
-        most, which = over.nan_to_num(0.0).topk(1 + len(over) // 1000)
-        worst, before = at.start + kept[at].nonzero()[which[most > 1.0], 0], work.state
+        worst, before = at.start + kept[at].nonzero()[next_out(over, len(over)), 0], work.state
         behind[worst] = True
         try:
             kept = explained(work, mask & ~behind, solver)
