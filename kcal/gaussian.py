@@ -183,8 +183,7 @@ def stacked(gaussians: Sequence[Gaussian]) -> Gaussian:
 def triangular(rows: Tensor) -> Tensor:
     """(C, C) upper triangle with the same products as rows (R, C)."""
     missing = max(0, rows.shape[1] - len(rows))
-    padded = torch.cat([rows, rows.new_zeros(missing, rows.shape[1])])
-    return torch.linalg.qr(padded, mode="r")[1]
+    return torch.linalg.qr(torch.cat([rows, rows.new_zeros(missing, rows.shape[1])]), mode="r")[1]
 
 
 def half_of_covariance(matrix: Tensor) -> Tensor:

@@ -121,8 +121,7 @@ def practice_site(folder: Path, seed: int, *, views: int = 12, frames: int = 600
         FileError: the folder has other files, or a site of another seed.
     """
     check_folder(folder, seed)
-    scene = practice.practice_scene(seed, views, scale)
-    site = practice.PracticeSite(scene)
+    site = practice.PracticeSite(practice.practice_scene(seed, views, scale))
     parts = list(_practice_parts(site, frames))
     missing = [(path, work, write) for path, work, write in parts if not (folder / path).exists()]
     done = 0

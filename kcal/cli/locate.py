@@ -36,8 +36,7 @@ def _print_positions(
     located: rooms.Located, true: rooms.Tensor | None, statuses: dict[str, int], *, stated: bool
 ) -> None:
     """Print the table with the reasons below it; of a long one the counts, and the rows that have a true position."""
-    errors = None if true is None else rooms.position_errors(located, true)
-    rows = rooms.position_rows(located, errors)
+    rows = rooms.position_rows(located, None if true is None else rooms.position_errors(located, true))
     shown: Sequence[int] = range(len(located.positions))
     if located.rows is not None:
         out.print(counts_text(located.rows, statuses))

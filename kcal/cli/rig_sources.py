@@ -557,8 +557,7 @@ def _add_landmarks(read: RigReading, path: Path) -> None:
 def _add_pairs(read: RigReading, files: Sequence[Path]) -> None:
     """Boards that two cameras saw, or any of more."""
     if len(read.cameras) != 2:
-        numbers = cameras_of_files(files, read.names)
-        own = dict(zip(numbers, map(kcal.Observations.load, files), strict=True))
+        own = dict(zip(cameras_of_files(files, read.names), map(kcal.Observations.load, files), strict=True))
         read.add("boards", rooms.boards_of_several(list(read.cameras.values()), read.names, own))
         return
     if len(files) != 2:

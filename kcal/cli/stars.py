@@ -133,8 +133,7 @@ def by_night(images: list[str] | None, night: Night, output: Path, name: str) ->
     """
     if not images:
         raise InputError("give observations of a board (from `kcal detect`), or night images with --stars")
-    found = _by_stars(images, night, output)
-    camera = found.lens.camera
+    camera = _by_stars(images, night, output).lens.camera
     if camera.calibration is not None and name:
         camera.calibration = dataclasses.replace(camera.calibration, name=name)
     kcal.save_camera(camera, output)
@@ -312,7 +311,6 @@ def _told(path: Path, found: rooms.NamedStars) -> dict[str, Any]:
 
 
 def _draw(picture: Path, image: Any, found: rooms.NamedStars, catalog: kcal.stars.StarCatalog, title: str) -> None:
-    star = found.attitude.star.tolist()
-    names = [catalog.name_of(int(catalog.number[i])) if i >= 0 else "" for i in star]
+    names = [catalog.name_of(int(catalog.number[i])) if i >= 0 else "" for i in found.attitude.star.tolist()]
     figure = rooms.stars_figure(image, found.detected.pixels, names, found.attitude.residual, title)
     kcal.report.save_picture(picture, figure)

@@ -410,8 +410,7 @@ def circle_order(pixels: Tensor, board: Board) -> Tensor | None:
     fits: list[tuple[float, float, Tensor]] = []
     for turn in turns:
         candidate = turn.reshape(-1, 2)
-        h = homography(points, candidate)
-        there = torch.nn.functional.pad(points, (0, 1), value=1.0) @ h.T
+        there = torch.nn.functional.pad(points, (0, 1), value=1.0) @ homography(points, candidate).T
         if not bool((there[:, 2] > 0).all()):
             continue
         miss = float((there[:, :2] / there[:, 2:] - candidate).norm(dim=-1).square().mean().sqrt())
@@ -459,8 +458,7 @@ def _find_grid(image: npt.NDArray[np.uint8], board: Board) -> Tensor | None:
 def _goes_on(blobs: Tensor, pixels: Tensor, board: Board) -> bool:
     """Whether more than half of the places one row or column beyond the grid have a blob."""
     points = board.points[:, :2] / board.square
-    h = homography(pixels, points)
-    there = torch.nn.functional.pad(blobs, (0, 1), value=1.0) @ h.T
+    there = torch.nn.functional.pad(blobs, (0, 1), value=1.0) @ homography(pixels, points).T
     seen = there[:, :2] / there[:, 2:]
     step = 2.0 if board.pattern == "asymmetric" else 1.0
     grid = points.reshape(board.rows, board.columns, 2)

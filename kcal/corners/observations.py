@@ -334,8 +334,7 @@ def rescaled(view: View, scale: tuple[float, float]) -> View:
     """
     x, y = scale
     spread = None if view.covariance is None else _rows(view.covariance, 3) * (x * x, x * y, y * y)
-    content = dict(view) | {"pixels": (view.places + 0.5) * scale - 0.5, "covariance": spread}
-    return View(**content)
+    return View(**dict(view) | {"pixels": (view.places + 0.5) * scale - 0.5, "covariance": spread})
 
 
 def _named(names: Sequence[str], group: Sequence[int]) -> str:

@@ -177,8 +177,7 @@ class CameraFile(NativeFile):
 
 def _listed(names: tuple[str, ...]) -> str:
     """Names for a message; the first and the last of very many."""
-    shown = names if len(names) <= 40 else (*names[:12], "...", names[-1])
-    return ", ".join(shown)
+    return ", ".join(names if len(names) <= 40 else (*names[:12], "...", names[-1]))
 
 
 def provenance() -> dict[str, Any]:

@@ -355,8 +355,7 @@ def fit_foreign(kind: str, camera: Camera) -> ForeignCamera:
         first = np.array([focal / slope, focal / slope, *camera.center.tolist(), *own])
         scale = np.array([focal, focal, 0.1 * focal, 0.1 * focal, *[0.1 if each else 0.01 for each in own]])
         found.append(least_squares(errors, first, bounds=(low, high), x_scale=scale, max_nfev=200))
-    best = min(found, key=lambda one: one.cost if math.isfinite(one.cost) else math.inf)
-    return filled(best.x)
+    return filled(min(found, key=lambda one: one.cost if math.isfinite(one.cost) else math.inf).x)
 
 
 # A hybrid lens through given rays and pixels: lenses of other programs that no parametric model of kcal has.

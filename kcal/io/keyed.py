@@ -264,8 +264,7 @@ def _for_all(content: Mapping[str, Any], roles: Sequence[str] = (*_SIZES, *_KIND
 def _with_shared(shared: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
     """The values of a camera, with those of all cameras; a size of its own is in place of theirs."""
     own = _flattened(part)
-    left = _for_all(shared, _KINDS if _for_all(own, _SIZES) else (*_SIZES, *_KINDS))
-    return left | own
+    return _for_all(shared, _KINDS if _for_all(own, _SIZES) else (*_SIZES, *_KINDS)) | own
 
 
 def _cameras_inside(content: Mapping[str, Any]) -> tuple[dict[str, Mapping[str, Any]], dict[str, Any]]:

@@ -101,8 +101,7 @@ class AdaptedCamera(Float64Module):
     def center(self) -> Tensor:
         """(2,) the pixel of the optical axis; the middle of the image if the axis has none."""
         pixel, valid = self.camera.project(self.params.new_tensor([[0.0, 0.0, 1.0]]))
-        middle = 0.5 * (self.params.new_tensor(self.size) - 1.0)
-        return torch.where(valid[:, None], pixel, middle)[0]
+        return torch.where(valid[:, None], pixel, 0.5 * (self.params.new_tensor(self.size) - 1.0))[0]
 
     @property
     def fingerprint(self) -> str:
@@ -246,8 +245,7 @@ def project_each(
         ]
     values = torch.stack([camera.values for camera in cameras])
     found = project_components(points, values, cameras[0].model, wanted[0])
-    parts = (part.unbind(axis) for part, axis in zip(found[:4], _CAMERAS, strict=True))
-    return list(map(Projection, *parts))
+    return list(map(Projection, *(part.unbind(axis) for part, axis in zip(found[:4], _CAMERAS, strict=True))))
 
 
 def project_stack(stack: CameraStack, points: Tensor, wanted: Sequence[Sequence[int]], meter: Tensor) -> Projection:

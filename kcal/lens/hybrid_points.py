@@ -315,8 +315,7 @@ class Backward(NamedTuple):
 
 def _planes(points: Tensor) -> tuple[Tensor, ...]:
     """The coordinates of points (n, K), each in its own memory; NumPy copies four times as fast."""
-    array = points.numpy()
-    return torch.from_numpy(np.ascontiguousarray(array.T)).unbind()
+    return torch.from_numpy(np.ascontiguousarray(points.numpy().T)).unbind()
 
 
 def _within(*limits: tuple[Tensor, float]) -> Tensor | None:

@@ -177,8 +177,7 @@ def _winds_once(x: Tensor, y: Tensor) -> Tensor:
     x, y = x / scale, y / scale
     next_x, next_y = x.roll(-1, -1), y.roll(-1, -1)
     cross, dot = x * next_y - y * next_x, x * next_x + y * next_y
-    total = torch.atan2(cross, dot).sum(-1)
-    return (cross > 0).all(-1) & (total < 3 * math.pi)
+    return (cross > 0).all(-1) & (torch.atan2(cross, dot).sum(-1) < 3 * math.pi)
 
 
 @torch.no_grad()

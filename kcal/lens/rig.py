@@ -449,8 +449,7 @@ class Rig(Movable, StatedModule):
         """
         from kornia.geometry.epipolar import cross_product_matrix
 
-        skewed = cross_product_matrix(self.right_from_left_translation[None])[0]
-        return skewed @ self.right_from_left_rotation
+        return cross_product_matrix(self.right_from_left_translation[None])[0] @ self.right_from_left_rotation
 
     @property
     def fundamental(self) -> Tensor:

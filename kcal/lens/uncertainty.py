@@ -112,8 +112,7 @@ def pixel_errors(camera: Camera, truth: Camera, places: Tensor, *, at: float = m
 
     def seen_apart(pixels: Tensor, at: float) -> Tensor:
         rays, valid = camera.unproject(pixels)
-        points = FAR * rays if math.isinf(at) else camera.ray_origins(rays) + at * rays
-        seen, visible = truth.project(points)
+        seen, visible = truth.project(FAR * rays if math.isinf(at) else camera.ray_origins(rays) + at * rays)
         return torch.where((valid & visible)[:, None], pixels - seen, torch.nan)
 
     everywhere = camera.grid(25, 17).reshape(-1, 2)

@@ -308,8 +308,7 @@ def _derived(radial: int, decentered: int, astigmatic: int, other: int) -> tuple
             m = abs(j - 1)
             if (j, n) == (1, 1) or ((j, n) == (1, 3) and part == 0):
                 continue
-            family = ASPECT if (j, n) == (-1, 1) else _family(m, n, part)
-            real_modes.append((i, part, family, n))
+            real_modes.append((i, part, ASPECT if (j, n) == (-1, 1) else _family(m, n, part), n))
     if not real_modes:
         raise InputError("Zernike modes: degrees this low leave no mode")
     modes = [(*complex_modes[i], part) for i, part, _, _ in real_modes]

@@ -116,8 +116,7 @@ def meeting_points(left: Tensor, right: Tensor, axes: Tensor, length: Tensor) ->
         valid = usable & sided & (sine * HORIZON > torch.sqrt(norm0 * norm1))
     along = length * y1 / torch.where(valid, sine, torch.inf)
     across = along * y0
-    points = torch.stack([along * x0, across * p, across * q], -1) @ axes.mT
-    return Found(points, valid)
+    return Found(torch.stack([along * x0, across * p, across * q], -1) @ axes.mT, valid)
 
 
 def baseline_axes(baseline: Tensor) -> Tensor:
@@ -336,8 +335,7 @@ def triangulate_linear(cam_from_world: Tensor, rays: Tensor, seen: Tensor | None
     in_cameras = (cameras[..., :3] @ local_points[..., None, :, None] + cameras[..., 3:])[..., 0]
     ahead_of_all = (((in_cameras * units).sum(-1) > 0) | ~counts).all(-1, keepdim=True)
     valid = finite & ahead_of_all & usable[..., 0, :]
-    points = middle + spread[..., None, :] * torch.where(valid, local_points, 0.0)
-    return Found(points, valid[..., 0])
+    return Found(middle + spread[..., None, :] * torch.where(valid, local_points, 0.0), valid[..., 0])
 
 
 def _null_vector(system: Tensor) -> tuple[Tensor, Tensor]:

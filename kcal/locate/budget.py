@@ -301,8 +301,7 @@ def range_sigmas(
         if rig.covariance is not None:
             factor = rig.covariance.half.T
             effect = slope[:, None] * calibration_effect(found.fit, found.scale, factor)[2].mT
-            by_lenses = effect @ row_space(factor[:-6])
-            lenses = by_lenses.norm(dim=-1)
+            lenses = (effect @ row_space(factor[:-6])).norm(dim=-1)
             pose = (effect.square().sum(-1) - lenses.square()).clamp_min(0.0).sqrt()
         stands = rig.mounting
         if stands is not None and stands.covariance is not None:
@@ -366,8 +365,7 @@ def station_sigmas(rig: Rig, distance: float, *, pixel_sigma: float | None = Non
     if not len(pixels):
         return None
     root = torch.zeros(1, rig.quantities, dtype=torch.float64) if rig.root is None else rig.root
-    lenses = root[:, : sum(rig.sizes)]
-    within = row_space(lenses.T)
+    within = row_space(root[:, : sum(rig.sizes)].T)
     # With exact lenses, what their errors have in common with the poses is known too.
     exact = root - within @ (within.T @ root)
     roots = torch.zeros_like(root), exact, root

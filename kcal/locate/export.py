@@ -90,8 +90,7 @@ def kml_regions(columns: PositionColumns, run: Located) -> str:
     """A polygon for each row that has a position."""
     names = [columns.names[i] for i in np.flatnonzero(columns.located).tolist()]
     placemarks = []
-    rings = (ring for block in ring_blocks(columns, run) for ring in block)
-    for name, ring in zip(names, rings, strict=True):
+    for name, ring in zip(names, (ring for block in ring_blocks(columns, run) for ring in block), strict=True):
         corners = np.stack([(ring[:, 1] + 180.0) % 360.0 - 180.0, ring[:, 0]], -1)
         places = number_lines(corners.round(CORNER_DECIMALS))
         placemarks.append(

@@ -192,8 +192,7 @@ def anchor(origin: Origin, device: torch.device | None = None) -> tuple[Tensor, 
 
 def place_enu(enu: Tensor, ecef_from_enu: Tensor, ecef_of_origin: Tensor) -> Tensor:
     """ENU (..., 3) to latitude, longitude, height, given the `anchor`; no checks, so that it can be compiled."""
-    geodetic = ecef_to_geodetic(enu @ ecef_from_enu.mT + ecef_of_origin)
-    lat, lon, height = geodetic.unbind(-1)
+    lat, lon, height = ecef_to_geodetic(enu @ ecef_from_enu.mT + ecef_of_origin).unbind(-1)
     return torch.stack([lat, torch.where(lon >= 180.0, lon - 360.0, lon), height], -1)
 
 

@@ -160,8 +160,7 @@ def by_mounting(enu: Tensor) -> Tensor:
     e, n, u = enu.unbind(-1)
     zero = torch.zeros_like(e)
     turns = torch.stack([zero, u, -n, -u, zero, e, n, -e, zero], -1).unflatten(-1, (3, 3))
-    still = torch.eye(3, dtype=enu.dtype, device=enu.device).expand(turns.shape)
-    return torch.cat([still, turns], -1)
+    return torch.cat([torch.eye(3, dtype=enu.dtype, device=enu.device).expand(turns.shape), turns], -1)
 
 
 @torch.no_grad()

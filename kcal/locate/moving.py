@@ -540,8 +540,7 @@ def _identities(
         return torch.tensor([[_sigmas(track, one, found, clock) for track in tracks] for one in own])
 
     tables = [misfits(found) for found in poses]
-    best = min(range(len(poses)), key=lambda i: float(tables[i].amin(1).clamp_max(2 * _NEAR).sum()))
-    found = poses[best]
+    found = poses[min(range(len(poses)), key=lambda i: float(tables[i].amin(1).clamp_max(2 * _NEAR).sum()))]
     for _ in range(2):
         table = misfits(found)
         chosen = [_chosen(row, tracks, one) for row, one in zip(table, own, strict=True)]

@@ -183,8 +183,7 @@ class PointLocator:
                 for row in found.misfit.tolist()
             ],
         }
-        reasons = _view_reasons(rig, found, self.buried)
-        return _as_columns(marks, found, reasons, self._numbers(own, []), extras)
+        return _as_columns(marks, found, _view_reasons(rig, found, self.buried), self._numbers(own, []), extras)
 
     def _numbers(self, found: Localization, more: Sequence[Group]) -> NDArray[np.float64]:
         ok = (found.status == int(PositionStatus.OK)).numpy()

@@ -53,8 +53,7 @@ class GroundSurface(NamedTuple):
         y = 2.0 * (north - self.corner[1]) / (self.step * (rows - 1)) - 1.0
         table = (self.below if heights else self.up)[None, None]
         found = torch.nn.functional.grid_sample(table, torch.stack([x, y], -1).reshape(1, 1, -1, 2), align_corners=True)
-        inside = (x.abs() <= 1.0) & (y.abs() <= 1.0)
-        return torch.where(inside, found.reshape(x.shape), math.nan)
+        return torch.where((x.abs() <= 1.0) & (y.abs() <= 1.0), found.reshape(x.shape), math.nan)
 
 
 def surface_of(ground: Ground, origin: Origin, low: Tensor, high: Tensor, step: float) -> GroundSurface:
@@ -312,8 +311,7 @@ def area_of(
     heights = ground(lats, lons)
     if not bool(heights.isfinite().any()):
         raise InputError("area: the terrain has no height there; does it cover these latitudes and longitudes?")
-    geodetic = torch.stack([lats, lons, heights.nan_to_num() + above], -1)
-    points = geodetic_to_enu(geodetic, origin)
+    points = geodetic_to_enu(torch.stack([lats, lons, heights.nan_to_num() + above], -1), origin)
     places = [geodetic_to_enu(site.origin.geodetic, origin) for site in sites]
     flat = torch.cat([points.reshape(-1, 3), *(place[None] for place in places)])[:, :2]
     meters = math.radians(cell) * mean_radius(origin.lat)

@@ -96,8 +96,7 @@ def stated_mounting(
     sigma = torch.tensor([*sigma_m, *map(math.radians, sigma_deg)], dtype=torch.float64)
     if not bool((sigma.isfinite() & (sigma >= 0)).all()):
         raise InputError("a station: sigmas must be finite and not negative")
-    axes = _axes(heading, pitch, roll)
-    by = torch.block_diag(torch.eye(3).double(), axes) * sigma
+    by = torch.block_diag(torch.eye(3).double(), _axes(heading, pitch, roll)) * sigma
     return Mounting(origin=origin, heading_deg=heading, pitch_deg=pitch, roll_deg=roll, covariance=by @ by.T)
 
 

@@ -183,8 +183,7 @@ class ViewsFit(NamedTuple):
     def _weight(self) -> Tensor:
         if self.weight is not None:
             return self.weight
-        still = torch.eye(len(self.fit.residual)).to(self.fit.residual)
-        return (still / self.variance)[..., None]
+        return (torch.eye(len(self.fit.residual)).to(self.fit.residual) / self.variance)[..., None]
 
     @property
     def chi2(self) -> Tensor:

@@ -244,8 +244,7 @@ def _minimized(residual: _Map, start: Floats, low: Floats, high: Floats, iterati
         normal, right = jacobian.T @ jacobian, jacobian.T @ r
         scale = np.diag(normal) + 1e-9
         for _ in range(5):
-            step = -np.linalg.solve(normal + np.diag(damping * scale), right)
-            moved = np.clip(p + step, low, high)
+            moved = np.clip(p - np.linalg.solve(normal + np.diag(damping * scale), right), low, high)
             there = residual(moved)
             if float(there @ there) < cost:
                 damping = max(damping / 5, 1e-9)

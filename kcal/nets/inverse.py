@@ -379,8 +379,7 @@ def _training_pixels(camera: Camera, counts: tuple[int, int]) -> Tensor:
     for size, count in zip(camera.size, counts, strict=True):
         place = -torch.cos(math.pi * (torch.arange(count, dtype=torch.float64) + 0.5) / count)
         axes.append(0.5 * (size - 1) + 0.5 * size * 1.05 * place)
-    grid = torch.stack(torch.meshgrid(*axes, indexing="xy"), -1).reshape(-1, 2)
-    return grid.to(camera.params.device)
+    return torch.stack(torch.meshgrid(*axes, indexing="xy"), -1).reshape(-1, 2).to(camera.params.device)
 
 
 def _distorted(camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:

@@ -525,8 +525,7 @@ def appearance(left: Tensor, boxes_left: Tensor, right: Tensor, boxes_right: Ten
     norm = (area * power.clamp_min(0.0)).sqrt() * torch.linalg.vector_norm(templates, dim=(-2, -1))[None, :, None, None]
     # Rounding of flat patches is no likeness.
     scale = 1e-6 * area * (left.abs().amax() * right.abs().amax()).clamp_min(1e-12)
-    found = torch.where(norm > scale, products / torch.where(norm > scale, norm, 1.0), 0.0)
-    return found.amax((-2, -1)).T
+    return torch.where(norm > scale, products / torch.where(norm > scale, norm, 1.0), 0.0).amax((-2, -1)).T
 
 
 def _patches(image: Tensor, boxes: Tensor, samples: int) -> Tensor:

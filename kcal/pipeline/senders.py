@@ -233,8 +233,7 @@ class LiveMap:
             for camera in run.cameras
         ]  # fmt: skip
         self.run, self.readers, self._start = run, 0, start
-        coast = coast_near(run.place.lat, run.place.lon)
-        self._site = orjson.dumps({"cameras": cameras, "coast": coast})
+        self._site = orjson.dumps({"cameras": cameras, "coast": coast_near(run.place.lat, run.place.lon)})
         # Number of the news, its columns, its time step and time; the last that was written for pages.
         self._news: tuple[int, PositionColumns | None, int, float] = (0, None, 0, 0.0)
         # Where each track has been, and when last.

@@ -172,8 +172,7 @@ def moved_on(beliefs: imm.Beliefs, up: Tensor, numbers: Tensor, stay: Tensor) ->
 
 def taken_in(beliefs: imm.Beliefs, seen: Anchored, timing: imm.Timing, root: Tensor | None) -> imm.Beliefs:
     """Beliefs with sightings, one for each track."""
-    found = imm.innovations(beliefs, seen, timing)
-    return imm.updated(beliefs, found, root)
+    return imm.updated(beliefs, imm.innovations(beliefs, seen, timing), root)
 
 
 def track_steps(localize: Localizer, lasting_px: float) -> TrackSteps:

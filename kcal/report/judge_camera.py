@@ -78,8 +78,7 @@ def _sides_finding(names: Sequence[str], severity: Severity) -> Finding | None:
 
     Where the views are at hand, their halves by name tell (`model_findings`), and names alone are a doubt.
     """
-    sides = list(names_by_side(names).items())
-    for (one, some), (other, others) in itertools.pairwise(sides):
+    for (one, some), (other, others) in itertools.pairwise(names_by_side(names).items()):
         both = [key for key in some if key in others]
         if 2 * len(both) > _PARTNERS * len(names):
             text = (

@@ -222,8 +222,7 @@ def _records(path: Path) -> Iterator[dict[str, Any]]:
         if path.suffix == ".csv":
             yield from csv.DictReader(io.StringIO(text.decode("utf-8-sig")))
             return
-        lines = text.splitlines() if path.suffix == ".geojsonl" else [text]
-        for line in lines:
+        for line in text.splitlines() if path.suffix == ".geojsonl" else [text]:
             content = orjson.loads(line)
             for feature in content.get("features", [content]):
                 yield dict(feature["properties"])

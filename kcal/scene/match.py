@@ -375,8 +375,7 @@ def _posed(rig: Rig, pixels: Tensor, covariance: Tensor) -> tuple[Rig, Tensor]:
     # What has no projection, or is behind both cameras.
     over = torch.where(mask & (work.state.items[:, 3] >= -_UNIT_SIGMA), over, torch.inf)
     rotation, center = work.state.rotation, work.state.center
-    relative = rotation[1] @ rotation[0].T
-    return Rig.pair(*cameras, relative, rotation[1] @ (center[0] - center[1])), over
+    return Rig.pair(*cameras, rotation[1] @ rotation[0].T, rotation[1] @ (center[0] - center[1])), over
 
 
 def _still(pairs: Sequence[ImagePair], found: Sequence[MatchedPair], k: int) -> MatchedPair:

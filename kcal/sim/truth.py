@@ -102,8 +102,7 @@ def tabulate(function: Callable[[Tensor], Tensor], window: PixelRectangle, degre
     # The discrete cosine transform: T_j at node i is cos(j θ_i).
     transform = torch.cos(order[:, None] * angles) * (2.0 / (degree + 1))
     transform[0] *= 0.5
-    coefficients = torch.einsum("ai,ijk,bj->akb", transform, sampled, transform)
-    return ChebyshevTable(window, coefficients.contiguous())
+    return ChebyshevTable(window, torch.einsum("ai,ijk,bj->akb", transform, sampled, transform).contiguous())
 
 
 # Trace chief rays: from a pixel through the middle of the aperture stop to its line of sight in front of the lens.

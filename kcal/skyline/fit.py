@@ -327,8 +327,7 @@ def fit_rotation(
 def _columns_that_agree(seen: Comparison, errors: SkylineErrors, most_below: float) -> Bools:
     ratio = seen.residual / column_sigma(seen, errors)
     wrong = ~seen.known | (ratio > _ABOVE) | (ratio < -most_below)
-    near = np.convolve(wrong, np.ones(2 * _BESIDE + 1), mode="same") > 0
-    return ~near
+    return ~(np.convolve(wrong, np.ones(2 * _BESIDE + 1), mode="same") > 0)
 
 
 def _in_bins(columns: Columns, seen: Comparison, used: Bools, width: int) -> Comparison:

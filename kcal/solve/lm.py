@@ -667,8 +667,7 @@ class LevenbergMarquardt(StatedModule):
             return minimize(
                 DenseProblem(self.residual, start.shape[:-1], data), (start,), self.options, callback, unroll=True
             )
-        constant = tuple(tensor.detach() for tensor in data)
-        problem = DenseProblem(self.residual, start.shape[:-1], constant)
+        problem = DenseProblem(self.residual, start.shape[:-1], tuple(tensor.detach() for tensor in data))
         result = minimize(problem, (start.detach(),), self.options, callback)
         result = dataclasses.replace(result, state=(result.x.detach(),))
         # Weights of the residual and tensors that it closes over enter the solution as data do.

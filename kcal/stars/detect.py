@@ -340,8 +340,7 @@ class PlannedStars(NamedTuple):
 
     def range_share(self, distance: float, baseline: float, pairs: int = 1, clock_sigma: float = 0.0) -> float:
         """Standard deviation of a range over the range: from stars and the clock; lens and marks come on top."""
-        angle = math.hypot(self.yaw_sigma / math.sqrt(pairs), EARTH_RATE * clock_sigma)
-        return distance / baseline * angle
+        return distance / baseline * math.hypot(self.yaw_sigma / math.sqrt(pairs), EARTH_RATE * clock_sigma)
 
 
 def planned_stars(plan: NightPlan) -> PlannedStars:
@@ -352,8 +351,7 @@ def planned_stars(plan: NightPlan) -> PlannedStars:
         >>> 20 < found.stars < 120
         True
     """
-    catalog = StarCatalog.bundled()
-    magnitude = np.sort(catalog.magnitude)
+    magnitude = np.sort(StarCatalog.bundled().magnitude)
     pixel = _ARCSECONDS / plan.focal_px
     trail = 15.04 * plan.seconds / pixel
     width, height = plan.size

@@ -520,8 +520,7 @@ def _directions(view: SkyView, catalog: StarCatalog) -> np.ndarray:
     there = view.directions(catalog)
     up = there[:, 2] > math.sin(math.radians(3.0))
     celestial = celestial_directions(catalog, view.time)
-    turn = turn_between(there[up], celestial[up])
-    return np.where(up[:, None], there @ turn.T, celestial)
+    return np.where(up[:, None], there @ turn_between(there[up], celestial[up]).T, celestial)
 
 
 def _ahead(rotation: np.ndarray, directions: np.ndarray, catalog: StarCatalog, view: SkyView) -> np.ndarray:

@@ -112,8 +112,7 @@ def star_state(parameters: Tensor, rotations: Sequence[Tensor]) -> BoardState:
 
 def lens_rows(problem: BoardProblem, state: BoardState, noise: float) -> Tensor:
     """(S, S + 1) triangle of what stars say of the lens, rotations eliminated, in standard deviations."""
-    rows = problem.reduced_rows(state)[:, [*problem.moving.tolist(), -1]]
-    return triangular(rows / noise)[:-1]
+    return triangular(problem.reduced_rows(state)[:, [*problem.moving.tolist(), -1]] / noise)[:-1]
 
 
 # Fit the default lens to stars: one lens, a rotation for each image, every star at infinity.
@@ -200,8 +199,7 @@ def fit_star_lens(
     estimate = _typical_estimate(model, focal, stars, size, state)
 
     def without_far(capture: FittedViews, estimate: Estimate) -> FittedViews:
-        weights = stars.near(model, estimate.state, CUT).weights
-        return dataclasses.replace(capture, weights=weights)
+        return dataclasses.replace(capture, weights=stars.near(model, estimate.state, CUT).weights)
 
     rounds = run_rounds(stars.fitted(size), estimate, reweigh=without_far)
     stars = stars._replace(weights=rounds.capture.weights, variance=rounds.estimate.variance)

@@ -132,8 +132,7 @@ def moments_of(
     Raises:
         InputError: images without times that are not as many for each camera.
     """
-    timed = all(image.view.time is not None for own in images for image in own)
-    if not timed:
+    if not all(image.view.time is not None for own in images for image in own):
         some = [camera for camera, own in enumerate(images) if own]
         if len({len(images[camera]) for camera in some}) > 1:
             raise InputError("images without times are paired in their order: as many are needed for each camera")

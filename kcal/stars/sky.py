@@ -399,8 +399,7 @@ _Pairs = tuple[NDArray[np.uint16], NDArray[np.float32], int]
 def _close_pairs(directions: NDArray[np.float64], largest: float) -> _Pairs:
     share = (1.0 - np.cos(largest)) / 2.0
     stars = int(min(len(directions), np.sqrt(2.0 * _MOST_PAIRS / share), 2**16 - 1))
-    tree = cKDTree(directions[:stars])
-    pairs = tree.query_pairs(2.0 * np.sin(largest / 2.0), output_type="ndarray")
+    pairs = cKDTree(directions[:stars]).query_pairs(2.0 * np.sin(largest / 2.0), output_type="ndarray")
     chord = np.linalg.norm(directions[pairs[:, 0]] - directions[pairs[:, 1]], axis=1)
     angle = (2.0 * np.arcsin(chord / 2.0)).astype(np.float32)
     order = np.argsort(angle, kind="stable")
@@ -558,8 +557,7 @@ def _triangles(
     stars = np.stack([first[at, 0], first[at, 1], second[partner, 1]], 1)
     third = _angle(table.directions[stars[:, 1]], table.directions[stars[:, 2]])
     stars = stars[np.abs(third - sides[2]) < reach + scale_error * sides[2]]
-    sense = np.linalg.det(table.directions[stars]) * np.linalg.det(corners)
-    return stars[sense > 0]
+    return stars[np.linalg.det(table.directions[stars]) * np.linalg.det(corners) > 0]
 
 
 def _best_turn(rotations: Floats, rays: Floats, tree: cKDTree, reach: float) -> tuple[Floats, int]:

@@ -89,8 +89,7 @@ def learned(series: AngleSeries) -> TurnModel:
 
     Measurements are thinned to some thousand, evenly; a compass search goes over the logarithms of the three numbers.
     """
-    known = np.isfinite(series.angle).any(1)
-    rows = np.flatnonzero(known)
+    rows = np.flatnonzero(np.isfinite(series.angle).any(1))
     if len(rows) < FEWEST:
         return TurnModel.usual()
     rows = rows[-MOST_LEARNT:] if len(rows) <= 2 * MOST_LEARNT else rows[:: len(rows) // MOST_LEARNT]

@@ -291,8 +291,7 @@ def located_at(history: Path, rig: Rig, locator: Callable[[Rig], PointLocator]) 
         parts = []
         for time, group in itertools.groupby(range(len(times)), times.__getitem__):
             rows = list(group)
-            standing = locator(watched.rig_at(float(time)))
-            parts.append(standing(marks.rows(slice(rows[0], rows[-1] + 1))))
+            parts.append(locator(watched.rig_at(float(time)))(marks.rows(slice(rows[0], rows[-1] + 1))))
         return PositionColumns.joined(parts)
 
     return locate

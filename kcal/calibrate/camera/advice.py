@@ -471,5 +471,4 @@ def _facing(ray: Tensor) -> Tensor:
     """The smallest turn of the optical axis into a ray."""
     axis = torch.stack([-ray[1], ray[0], torch.zeros_like(ray[0])])
     sine = torch.linalg.vector_norm(axis)
-    angle = torch.atan2(sine, ray[2])
-    return rotation_from_vector(axis / sine.clamp_min(1e-300) * angle)
+    return rotation_from_vector(axis / sine.clamp_min(1e-300) * torch.atan2(sine, ray[2]))

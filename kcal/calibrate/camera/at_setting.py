@@ -516,8 +516,7 @@ class ComparisonResult:
     @property
     def rms(self) -> dict[str, float]:
         """Model -> sqrt(mean ‖r‖²) over all held-out corners, pixels."""
-        values = (self.costs.sum(-1) / self.corners.sum()).sqrt()
-        return dict(zip(self.models, values.tolist(), strict=True))
+        return dict(zip(self.models, (self.costs.sum(-1) / self.corners.sum()).sqrt().tolist(), strict=True))
 
     @property
     def ranking(self) -> list[tuple[str, float, float, float]]:
@@ -623,8 +622,7 @@ def compare_models(
             if covariances is not None and not weighted:
                 weights, weighted = whitening(covariances, 0.5 * found.rms**2), True
             test = Views(board_points=found.board_points, pixels=observations.pixels()[out], whitening=weights[out])
-            solved = poses_under(found.camera, test, POSES)
-            by_view, _ = held_out_squares(found.camera, test, judge, *solved)
+            by_view, _ = held_out_squares(found.camera, test, judge, *poses_under(found.camera, test, POSES))
             for g in held:
                 costs[number, g] = by_view[[out.index(i) for i in members[g]]].sum()
     if not bool(costs.isfinite().any()) and failures:

@@ -195,8 +195,7 @@ def least_planar(board_points: Tensor, pixels: Tensor, names: Sequence[str]) -> 
         'c (its corners are 59 px off a flat board)'
     """
     homography = homographies(board_points, pixels)
-    flat = torch.cat([board_points[:, :2], torch.ones_like(board_points[:, :1])], 1)
-    seen = flat @ homography.mT
+    seen = torch.cat([board_points[:, :2], torch.ones_like(board_points[:, :1])], 1) @ homography.mT
     off = (seen[..., :2] / seen[..., 2:] - pixels).square().sum(-1).nanmean(-1).sqrt().nan_to_num(nan=math.inf)
     worst = off.argsort(descending=True)[:_WORST].tolist()
     # A lens bends boards, too, but those of all views.

@@ -188,8 +188,7 @@ def format_for(path: str | Path, format: str | None = None) -> str:
             raise InputError(
                 f"kcal reads {format} files and does not write them; choose one of {', '.join(_written())}"
             )
-        bag = format == "ros" and path.suffix.lower() in FORMATS["bag"].suffixes
-        return "bag" if bag else format
+        return "bag" if format == "ros" and path.suffix.lower() in FORMATS["bag"].suffixes else format
     by_suffix = {suffix: name for name, known in FORMATS.items() for suffix in known.suffixes} | {".npz": REMAP}
     if path.name == "camera_models.json":
         return "opensfm"

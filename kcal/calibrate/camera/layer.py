@@ -137,8 +137,7 @@ class CalibratedViews:
         """
         points = as_points("points_cam", points_cam, 3).transpose(-1, -2)
         seen = project_components(points, self.parameters, self.model)
-        pixels = torch.where(seen.regular[..., None, :], seen.pixels, 0.0)
-        return pixels.transpose(-1, -2), seen.regular
+        return torch.where(seen.regular[..., None, :], seen.pixels, 0.0).transpose(-1, -2), seen.regular
 
     def camera(self, *, differentiable: bool = False) -> Camera:
         """The camera; `differentiable`: in the graph, so that what is computed with it has gradients by the corners.

@@ -451,8 +451,7 @@ class CameraCalibrationResult(ArrowRows):
     def rejected_share(self) -> float:
         """Share of all corners that was left out, those of left-out views included."""
         gone = len(self.rejected_corners) + sum(view.corners for view in self.rejected_views)
-        used = int(torch.isfinite(self.residuals).all(-1).sum())
-        return gone / (gone + used)
+        return gone / (gone + int(torch.isfinite(self.residuals).all(-1).sum()))
 
     @property
     def excluded(self) -> tuple[Exclusion, ...]:

@@ -501,8 +501,7 @@ class IntervalCheck:
     def squares(self) -> Tensor:
         """(K, R, rows, columns) squares of the errors over the covariance that is stated: χ² of two degrees."""
         half = torch.linalg.cholesky(self.stated)
-        away = torch.linalg.solve_triangular(half, self.errors[..., None], upper=False)
-        return away.square().sum((-1, -2))
+        return torch.linalg.solve_triangular(half, self.errors[..., None], upper=False).square().sum((-1, -2))
 
     @property
     def coverage(self) -> Tensor:

@@ -454,8 +454,7 @@ def general_findings(
 def board_distances(result: CameraCalibrationResult) -> tuple[float, float]:
     """Of the board's middle in the nearest and in the farthest view, meters."""
     board = result.observations.board
-    far = result.cam_from_board_translation
-    middle = (result.cam_from_board_rotation @ board.points.mean(0)) + far
+    middle = (result.cam_from_board_rotation @ board.points.mean(0)) + result.cam_from_board_translation
     distance = middle.norm(dim=-1)
     distance = distance[distance.isfinite()]
     return float(distance.min()), float(distance.max())

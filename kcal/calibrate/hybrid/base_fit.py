@@ -145,8 +145,7 @@ def _base_of(
         base, points = other, points + other.state.board * stretch.shapes[0].T
     if len(base.state.rotation) == len(pixels):
         return base
-    params = base.state.parameters
-    offset = torch.where(capture.seen[..., None], pixels - params[2:4], 0.0)
+    offset = torch.where(capture.seen[..., None], pixels - base.state.parameters[2:4], 0.0)
     if base.aspect is not None:
         offset = offset / torch.tensor([1.0, base.aspect], dtype=torch.float64)
     ideal, usable = _through_base(offset, capture.seen, base.focal, base.shape)
@@ -266,8 +265,7 @@ def _with_constants(
 ) -> tuple[LensModel, PriorFamilies]:
     """A lens on a base projection, and its priors."""
     form = HybridForm(shape=base.shape, radius=_REACH * 0.5 * math.hypot(*size) / base.focal, modes=modes)
-    families = prior_families(form, base.focal, board, size, base.distance, base.aspect)
-    return LensModel(hybrid=form), families
+    return LensModel(hybrid=form), prior_families(form, base.focal, board, size, base.distance, base.aspect)
 
 
 def _leading(model: LensModel, focal: float, families: PriorFamilies) -> Tensor:

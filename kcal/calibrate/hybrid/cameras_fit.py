@@ -264,8 +264,7 @@ def grouped(cameras: Sequence[CameraFit], kinds: Sequence[Board]) -> list[Camera
             home.said, home.evidence = stacked([home.said, out[i].message]).compressed(), together
     # Boards are numbered by their first cameras.
     for k, group in enumerate(sorted(groups, key=lambda group: min(group.members))):
-        but_one = _but_one([out[i].message for i in group.members])
-        for i, others in zip(group.members, but_one, strict=True):
+        for i, others in zip(group.members, _but_one([out[i].message for i in group.members]), strict=True):
             if others is not None:
                 gains = [group.evidence - alone[i] - _evidence([others], out[i])]
             else:
@@ -299,8 +298,7 @@ def compared(camera: CameraFit, known: Gaussian, kind: Board) -> CameraFit:
 def others_of(cameras: Sequence[CameraFit], board: int) -> dict[int, Gaussian | None]:
     """For each camera that saw a board: what all others say of it."""
     members = [i for i, camera in enumerate(cameras) if camera.board == board]
-    said = _but_one([cameras[i].message for i in members])
-    return dict(zip(members, said, strict=True))
+    return dict(zip(members, _but_one([cameras[i].message for i in members]), strict=True))
 
 
 def _but_one(messages: Sequence[Gaussian]) -> list[Gaussian | None]:

@@ -146,8 +146,7 @@ def _with_weights(estimate: Estimate, weights: Tensor) -> Estimate:
 
 def _split(trunk: nn.Module, weights: Tensor) -> list[Tensor]:
     """The weights (T,) as those of the network."""
-    sizes = [part.numel() for part in trunk.parameters()]
-    pieces = weights.split(sizes)
+    pieces = weights.split([part.numel() for part in trunk.parameters()])
     return [piece.view_as(part) for piece, part in zip(pieces, trunk.parameters(), strict=True)]
 
 

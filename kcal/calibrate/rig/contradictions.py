@@ -275,8 +275,7 @@ def _of_free_lenses(problem: RigProblem, known: Part) -> Part:
 
 
 def _sum(parts: Sequence[Part], chosen: Iterable[int], known: Part | None = None) -> Tensor:
-    grams = [parts[i].gram for i in chosen] + ([] if known is None else [known.gram])
-    return torch.stack(grams).sum(0)
+    return torch.stack([parts[i].gram for i in chosen] + ([] if known is None else [known.gram])).sum(0)
 
 
 def _name(parts: Sequence[Part], group: tuple[int, ...]) -> str:

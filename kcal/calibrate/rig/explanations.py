@@ -390,8 +390,7 @@ def _refuse_terms(work: Adjustment, mask: Tensor, kept: Tensor | None, robust: R
             others = without_wrong(trial, mask, solver)
         except InputError:
             continue
-        size = 1 + int((mask & ~others).sum())
-        ways.append(_Explanation.of(trial, others, (part.name,), size))
+        ways.append(_Explanation.of(trial, others, (part.name,), 1 + int((mask & ~others).sum())))
     fewest = min((way.size for way in ways), default=0)
     ways = sorted((way for way in ways if way.size == fewest), key=_excess)
     ways = [way for way in ways if _excess(way) < _excess(ways[0]) + AS_GOOD]

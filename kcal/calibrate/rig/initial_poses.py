@@ -303,7 +303,6 @@ class InitialPoses:
         for c in reversed(range(len(self.data.cameras))):
             seen = self._good[:, c] if count else self._good.new_zeros(0)
             if bool(seen.any()):
-                back = start.rotation[c].T
-                rotation[seen] = back @ self._alone[c].rotation[seen]
+                rotation[seen] = start.rotation[c].T @ self._alone[c].rotation[seen]
                 translation[seen] = self._alone[c].translation[seen] @ start.rotation[c] + start.center[c]
         return rotation, translation

@@ -336,8 +336,7 @@ def evenly(count: int, most: int) -> Tensor:
 
 def half_turn(board: Tensor) -> Pose:
     """From a board (N, 3) to the same board read from its other end: half a turn about its middle."""
-    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
-    return Pose(turn, board.amin(0) + board.amax(0))
+    return Pose(torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)), board.amin(0) + board.amax(0))
 
 
 def consensus(

@@ -336,8 +336,7 @@ def _few_others_fall(total: Tensor, rows: Tensor) -> Tensor:
     values, vectors = torch.linalg.eigh(thrown.mT @ thrown)
     along = (vectors.mT @ rows[:, -1, :, None])[..., 0]
     testable = values[:, -1] < 1.0 - _LEAST_LEFT
-    fall = (along.square() * values / (1.0 - values).clamp_min(_LEAST_LEFT)).sum(-1)
-    return torch.where(testable, fall, 0.0)
+    return torch.where(testable, (along.square() * values / (1.0 - values).clamp_min(_LEAST_LEFT)).sum(-1), 0.0)
 
 
 class GoodnessOfFit(NamedTuple):

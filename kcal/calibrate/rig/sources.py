@@ -114,8 +114,7 @@ class Boards(ItemSource):
         """(V, C, N), or (V, C, N, 2, 2), by which residuals are multiplied; corners have `sigma` on average."""
         if self.covariance is None:
             return torch.full(self.pixels.shape[:-1], 1.0 / sigma, dtype=torch.float64)
-        flat = self.covariance.flatten(0, 2)
-        return (whitening(flat, sigma**2) / sigma).unflatten(0, self.pixels.shape[:3])
+        return (whitening(self.covariance.flatten(0, 2), sigma**2) / sigma).unflatten(0, self.pixels.shape[:3])
 
     def seen_well(self, cameras: Sequence[Camera]) -> Tensor:
         """(V, C) whether a camera alone can tell how a board lies."""
