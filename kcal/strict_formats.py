@@ -9,7 +9,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -108,11 +108,6 @@ _NUMBERS = range(6, 16)
 ByteOrder = Literal["<", ">"]
 
 
-class _Element(NamedTuple):
-    kind: int
-    data: bytes
-
-
 class _Reader:
     """Elements one after the other in bytes of one byte order."""
 
@@ -122,7 +117,7 @@ class _Reader:
     def more(self) -> bool:
         return self.at + 8 <= len(self.data)
 
-    def element(self) -> _Element:
+    def element(self) -> tuple[int, bytes]:
         """The next one; a small one has its data in its tag."""
         if not self.more():
             raise ValueError("it ends too early")
@@ -136,7 +131,7 @@ class _Reader:
             raise ValueError("an element is longer than the file")
         end = begin + size
         self.at = end if kind == _COMPRESSED else end + -end % 8 if begin > self.at + 4 else self.at + 8
-        return _Element(kind, self.data[begin:end])
+        return kind, self.data[begin:end]
 
     def values(self, *kinds: int) -> np.ndarray:
         """The numbers of the next element."""

@@ -320,7 +320,7 @@ def watch_command(
         print_wrote(rooms.save_history(output, parquet))
     with steps("fitting how it turns", None):
         watched = kcal.rig.Watched.read(output, known)
-    _tell_turns(watched, limit)
+    _tell_turns(watched)
     if picture is not None:
         _draw_turns(watched, picture, limit, output.name)
     if relock is not None:
@@ -408,7 +408,7 @@ def _summary(watcher: rooms.Watcher, hooks: list[rooms.Webhook]) -> str:
     return "; ".join(parts)
 
 
-def _tell_turns(watched: kcal.rig.Watched, limit: float) -> None:
+def _tell_turns(watched: kcal.rig.Watched) -> None:
     """The attitude now, and how the rig turns."""
     drift = watched.drift_at(watched.times[-1])
     model, degrees = watched.model, math.degrees(1.0)

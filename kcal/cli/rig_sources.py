@@ -348,12 +348,12 @@ def _add_skyline(read: RigReading, raster: Path) -> None:
         source, found = kcal.rig.skyline_source(images, cameras, ground, read.origin, centers, sigma, error=error)
     shown = [(image.name, image.image) for image in images]
     draw_picture(given.skyline_picture, lambda: rooms.skyline_figure(shown, found))
-    read.notes += [line for image, one in zip(images, found, strict=True) for line in _lines(image, names, one)]
+    read.notes += [line for image, one in zip(images, found, strict=True) for line in _lines(image, one)]
     warn(*(f"skyline {image.name}: {text}" for image, one in zip(images, found, strict=True) for text in one.warnings))
     read.add("skyline", source)
 
 
-def _lines(image: kcal.rig.SkylineImage, names: Sequence[str], found: rooms.SkylineAttitude) -> list[str]:
+def _lines(image: kcal.rig.SkylineImage, found: rooms.SkylineAttitude) -> list[str]:
     heading, pitch, roll = found.sigma_deg.tolist()
     shares = ", ".join(f"{name} {100 * share[0]:.0f} %" for name, share in found.shares.items() if share[0] > 0.005)
     next_best = f"; next best heading {found.second_deg:.1f}° (χ² larger by {found.second_worse:.0f})"

@@ -274,29 +274,9 @@ def level_ground(height: float) -> Ground:
     return lambda lat, lon: torch.full_like(lat, height)
 
 
-class Meeting(NamedTuple):
-    """Where lines of sight meet the ground for the first time.
-
-    Attributes:
-        distance: (N,) along each line.
-        point: (N, 3) there.
-        normal: (N, 3) slope of the height above the ground by the place.
-        tangent: (N, 3) of the line.
-        approach: (N,) slope of the height above the ground along the line; -1 unless `met`.
-        met: (N,) bool.
-    """
-
-    distance: Tensor
-    point: Tensor
-    normal: Tensor
-    tangent: Tensor
-    approach: Tensor
-    met: Tensor
-
-
 def first_meeting(
     along: Callable[[Tensor, Tensor], Tensor], above: Callable[[Tensor], Tensor], count: int, distances: Tensor
-) -> Meeting:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Follow lines of sight outward until they are below the ground, or over ground that is not known.
 
     Args:
@@ -304,6 +284,10 @@ def first_meeting(
         above: height of places (..., 3) above the ground; NaN where that is not known.
         count: N lines.
         distances: (K,) increasing from that of the camera.
+
+    Returns:
+        Which lines (N,) meet the ground, where (N, 3) they do so first, and the slope (N, 3) of the height above the
+        ground by the place.
     """
     parts = []
     for rows in torch.arange(count).split(_ROWS):
@@ -325,9 +309,7 @@ def first_meeting(
     steps = _STEP_M * torch.eye(3, dtype=torch.float64)
     normal = (above(point[:, None] + steps) - above(point[:, None] - steps)) / (2 * _STEP_M)
     tangent = along(distance + 0.5, rows) - along(distance - 0.5, rows)
-    approach = (normal * tangent).sum(-1)
-    met = met & torch.isfinite(normal).all(-1) & (approach < 0)
-    return Meeting(distance, point, normal, tangent, torch.where(met, approach, -1.0), met)
+    return met & torch.isfinite(normal).all(-1) & ((normal * tangent).sum(-1) < 0), point, normal
 
 
 # Where a camera's line of sight reaches a stated height or the ground, by which one camera alone is enough.
@@ -416,12 +398,12 @@ def _ground_ahead(
     # In equal steps, or in growing ones over level ground.
     step = getattr(ground, "cell_m", None)
     distances = torch.arange(0.0, _FARTHEST + step, step, dtype=torch.float64) if step else _GROWING
-    found = first_meeting(along, above, len(wanted), distances)
+    reached, there, slope = first_meeting(along, above, len(wanted), distances)
     met = torch.zeros_like(alone)
-    met[wanted] = found.met
+    met[wanted] = reached
     point, normal = place + ray, torch.zeros_like(place)
-    point[wanted] = torch.where(found.met[:, None], found.point, point[wanted])
-    normal[wanted] = torch.where(found.met[:, None], found.normal, 0.0)
+    point[wanted] = torch.where(reached[:, None], there, point[wanted])
+    normal[wanted] = torch.where(reached[:, None], slope, 0.0)
     return StatedHeight(point, normal, torch.full_like(place[:, 0], sigma), met)
 
 

@@ -84,9 +84,11 @@ def status_counts(status: Tensor) -> str:
     return ", ".join(f"{number} {PositionStatus(code).name}" for code, number in sorted(counts.items())) or "no points"
 
 
-def flag_positions(code: Tensor, condition: Tensor, status: PositionStatus) -> Tensor:
-    """`code` (int8) with `status` where the condition is true."""
-    return torch.where(condition, code.new_full((), int(status)), code)
+def flag_positions(code: Tensor, *flags: tuple[Tensor, enum.IntEnum]) -> Tensor:
+    """`code` (whole numbers) with a status where its condition is true; where several are, the last of them."""
+    for condition, status in flags:
+        code = torch.where(condition, code.new_full((), int(status)), code)
+    return code
 
 
 def checked_rig(rig: Rig, pixel_sigma: float | None) -> float:
@@ -207,14 +209,14 @@ def sight_lines(rig: Rig, pixels_left: Tensor, pixels_right: Tensor) -> SightLin
     parallel, opposite, along_baseline = _epipolar(rays_left, rays_right @ rotation, -translation @ rotation)
     points, solved = triangulate_pairs(rays_left, rays_right, (rotation, translation))
     code = torch.full(rays_left.shape[:-1], int(PositionStatus.OK), dtype=torch.int8, device=rays_left.device)
-    for condition, status in (
+    code = flag_positions(
+        code,
         (parallel | along_baseline, PositionStatus.PARALLEL),
         ((opposite | ~(solved | parallel)) & ~along_baseline, PositionStatus.BEHIND),
         (~seen.all(-2), PositionStatus.OUTSIDE_LENS),
         (~inside, PositionStatus.OUTSIDE_IMAGE),
         (~finite, PositionStatus.NOT_FINITE),
-    ):
-        code = flag_positions(code, condition, status)
+    )
     return SightLines(rays.movedim(-3, -2), points, code, along_baseline)
 
 

@@ -269,15 +269,15 @@ def fit_views(
         code = torch.full(used.shape[:-1], int(PositionStatus.OK), dtype=torch.int8, device=used.device)
         count = used.sum(-1)
         nothing = count == 0
-        for condition, status in (
+        code = flag_positions(
+            code,
             (count == 1, PositionStatus.BEARING_ONLY),
             (nothing & ~seen.any(-1), PositionStatus.MASKED),
             (nothing & (seen & ~finite).any(-1), PositionStatus.NOT_FINITE),
             (nothing & (wanted & ~inside).any(-1), PositionStatus.OUTSIDE_IMAGE),
             (nothing & (wanted & inside & ~valid).any(-1), PositionStatus.OUTSIDE_LENS),
             ((wanted & ~sound).any(-1), PositionStatus.BAD_COVARIANCE),
-        ):
-            code = flag_positions(code, condition, status)
+        )
         anchor = first_seen(used)
         anchor = torch.cat([anchor[..., :1] | nothing[..., None], anchor[..., 1:]], -1)
         ray = (anchor[..., None] * in_frame).sum(-2)
@@ -293,7 +293,7 @@ def fit_views(
             stated = height(place, ray, anchor, count == 1)
             alone = (count == 1) & stated.reached
             away, met = torch.where(alone[..., None], stated.point - place, away), met | alone
-            code = flag_positions(code, alone, PositionStatus.OK)
+            code = flag_positions(code, (alone, PositionStatus.OK))
         away = torch.where(met[..., None], away, ray)
         distance = torch.linalg.vector_norm(away, dim=-1)
         ahead, inverse = away / distance[..., None], torch.where(met, scale / distance, 0.0)
@@ -420,10 +420,8 @@ def fit_pairs(
     with torch.no_grad():
         lines = sight_lines(rig, left, right)
         weight, sound = inverse_covariances(cov)
-        code = flag_positions(lines.status, ~sound, PositionStatus.BAD_COVARIANCE)
-        code = flag_positions(code, ~finite, PositionStatus.NOT_FINITE)
-        if mask is not None:
-            code = flag_positions(code, ~mask, PositionStatus.MASKED)
+        flags = (~sound, PositionStatus.BAD_COVARIANCE), (~finite, PositionStatus.NOT_FINITE)
+        code = flag_positions(lines.status, *flags, *([] if mask is None else [(~mask, PositionStatus.MASKED)]))
         met = code == int(PositionStatus.OK)
         usable = met | ((code == int(PositionStatus.PARALLEL)) & ~lines.along_baseline)
         scale = rig.baseline.detach()
@@ -475,13 +473,15 @@ def reach_of(found: ViewsFit, variance: Tensor, behind: Tensor | None = None) ->
     with torch.no_grad():
         weak = usable & (~known | (value < BEARING_SIGMAS * sigma))
         lost = usable & ~(value > 0)
-        code = flag_positions(code, weak & (code == int(PositionStatus.OK)), PositionStatus.BEARING_ONLY)
-        if behind is not None:
-            code = flag_positions(code, behind, PositionStatus.BEHIND)
-        code = flag_positions(code, lost, PositionStatus.PARALLEL)
         # What the closed form put at infinity may have come back in front of the rig.
         back = usable & ~lost & ~weak
-        code = flag_positions(code, back if behind is None else back & ~behind, PositionStatus.OK)
+        code = flag_positions(
+            code,
+            (weak & (code == int(PositionStatus.OK)), PositionStatus.BEARING_ONLY),
+            *([] if behind is None else [(behind, PositionStatus.BEHIND)]),
+            (lost, PositionStatus.PARALLEL),
+            (back if behind is None else back & ~behind, PositionStatus.OK),
+        )
     low, high = map(found.steady, range_interval(value, sigma, known))
     return Reach(value, sigma, low, high, code)
 

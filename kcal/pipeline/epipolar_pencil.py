@@ -211,18 +211,6 @@ _REST = 1e-12
 _ELSEWHERE = 10.0
 
 
-class ClearGroups(NamedTuple):
-    """K groups of V cameras.
-
-    Attributes:
-        marks: (K, V) numbers of detections, -1 where there is none.
-        rival: (K, V) bool: another assignment of this mark is about as likely.
-    """
-
-    marks: Ints
-    rival: NDArray[np.bool_]
-
-
 class _FittedGroups(NamedTuple):
     """M groups with their points.
 
@@ -290,10 +278,13 @@ class Confirming:
             # Nearest to the point that all views tell, without those that contradict.
             marks, _ = self._nearest(done, own, trees)
             done = self._fit(np.unique(marks[(marks >= 0).sum(1) >= FEWEST_VIEWS], axis=0))
-        return self._assigned(self._chosen(done, misses), own, trees).marks
+        return self._assigned(self._chosen(done, misses), own, trees)[0]
 
-    def settled(self, marks: Ints, free: NDArray[np.bool_]) -> ClearGroups:
-        """Groups (K, V) with the marks of each camera assigned to all of them anew."""
+    def settled(self, marks: Ints, free: NDArray[np.bool_]) -> tuple[Ints, NDArray[np.bool_]]:
+        """Groups (K, V) with the marks of each camera assigned to all of them anew, -1 where there is none.
+
+        Also where (K, V) another assignment of a mark is about as likely.
+        """
         own, trees = self._trees(free)
         return self._assigned(self._fit(marks), own, trees)
 
@@ -433,7 +424,9 @@ class Confirming:
                     clear[holder] &= bool(saved[chosen[holder]] - saved[one] >= self.near)
         return done.at(np.array(chosen, dtype=np.int64)[np.array(clear, dtype=bool)])
 
-    def _assigned(self, done: _FittedGroups, own: list[Ints], trees: dict[int, cKDTree]) -> ClearGroups:
+    def _assigned(
+        self, done: _FittedGroups, own: list[Ints], trees: dict[int, cKDTree]
+    ) -> tuple[Ints, NDArray[np.bool_]]:
         marks, rival = np.full_like(done.marks, -1), np.zeros(done.marks.shape, dtype=bool)
         for c, (number, squared) in enumerate(self._nearest(done, own, trees)[1]):
             if c not in trees or not len(marks):
@@ -444,7 +437,7 @@ class Confirming:
             best, rival[:, c] = assign_groups(cost, self.gate**2, self.near)
             marks[:, c] = np.where(best >= 0, own[c][best], -1)
         several = (marks >= 0).sum(1) >= FEWEST_VIEWS
-        return ClearGroups(marks[several], rival[several])
+        return marks[several], rival[several]
 
     def _enough(self, done: _FittedGroups, misses: int) -> NDArray[np.bool_]:
         """Which groups have views enough that do not contradict each other."""

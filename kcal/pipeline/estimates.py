@@ -106,8 +106,8 @@ def track_states(
     variance = ((slope[:, None] * noise[:3, :3]).sum(0) * slope).sum(0)
     sigma = (variance + (slope[:, None] * spread[:3]).sum(0).square().sum(0)).clamp_min(0.0).sqrt()
     status = torch.zeros_like(inverse_range, dtype=torch.int8)
-    status = flag_positions(status, inverse_range < BEARING_SIGMAS * sigma, PositionStatus.BEARING_ONLY)
-    status = flag_positions(status, inverse_range <= 0, PositionStatus.PARALLEL)
+    weak = inverse_range < BEARING_SIGMAS * sigma
+    status = flag_positions(status, (weak, PositionStatus.BEARING_ONLY), (inverse_range <= 0, PositionStatus.PARALLEL))
     ok = status == int(PositionStatus.OK)
     low, high = range_interval(inverse_range, sigma)
 

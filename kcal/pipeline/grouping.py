@@ -185,16 +185,16 @@ class _Scene:
         all_found = np.concatenate(found)
         if not len(all_found):
             return groups, free
-        settled = confirming.settled(all_found, every)
+        settled, rival = confirming.settled(all_found, every)
         # Without the marks that could as well be of another target, if views enough are left.
-        sure = np.where(settled.rival, -1, settled.marks)
+        sure = np.where(rival, -1, settled)
         doubtful = (sure >= 0).sum(1) < FEWEST_VIEWS
-        rows = np.where(doubtful[:, None], settled.marks, sure)
+        rows = np.where(doubtful[:, None], settled, sure)
         number = {mark: i for i, row in enumerate(rows.tolist()) for mark in row}
         for group in self._fitted([tuple(row) for row in rows.tolist()]):
             which = number[max(group.marks)]
             groups.append(group._replace(doubt=bool(doubtful[which])))
-            free[settled.marks[which][settled.marks[which] >= 0]] = False
+            free[settled[which][settled[which] >= 0]] = False
         return groups, free
 
     def _middle(self, c: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

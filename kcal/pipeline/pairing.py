@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from kcal.corners.match import MatchStatus
 from kcal.dispatch import still
 from kcal.errors import InputError
 from kcal.lens.rig import Rig
+from kcal.locate.stereo import flag_positions
 from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
 from kcal.texts import brief, briefly
@@ -499,14 +500,15 @@ class ObjectDisparity(StatedModule):
             searched = (scores > -1.0).flatten(1).any(1)
             textured = patches.is_textured(template, weight)
             # What is named last counts first.
-            status = _flagged(torch.full_like(score, int(MatchStatus.GOOD), dtype=torch.int64), (
+            status = flag_positions(
+                torch.full_like(score, int(MatchStatus.GOOD), dtype=torch.int64),
                 (rival > options.max_rival * score, MatchStatus.AMBIGUOUS),
                 (edge | (score < options.min_score), MatchStatus.NO_MATCH),
                 (~textured, MatchStatus.FLAT),
                 (bright > 1.0 - options.min_share, MatchStatus.SATURATED),
                 (outside | ~searched & textured, MatchStatus.OUTSIDE),
                 (~(planes.valid & named), MatchStatus.NO_RAY),
-            ))  # fmt: skip
+            )
             found = status == int(MatchStatus.GOOD)
         fit = patches.fit_shifts(template, second, moved, slopes, weight, found)
         column = start + planes.step[:, None] * fit.shift
@@ -519,12 +521,13 @@ class ObjectDisparity(StatedModule):
             by_anchor = middle @ torch.linalg.inv_ex(own)[0]
             off_line = (column[:, 1] / planes.step).abs() * 2**level
             sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-            status = _flagged(status, (
+            status = flag_positions(
+                status,
                 (found & (off_line > options.max_off_line), MatchStatus.OFF_LINE),
                 (found & ~(sigma < options.max_sigma), MatchStatus.FLAT),
                 (found & (fit.share < options.min_share), MatchStatus.OCCLUDED),
                 (found & ~fit.converged, MatchStatus.NOT_CONVERGED),
-            ))  # fmt: skip
+            )
             good = status == int(MatchStatus.GOOD)
             score = torch.where(score > -1.0, score, 0.0)
             infinite = torch.diag(covariance.new_full((2,), math.inf))
@@ -563,13 +566,6 @@ class _Objects(NamedTuple):
         half = 0.5 * (self.boxes[:, 2:] - self.boxes[:, :2])[:, None, None]
         radius = torch.linalg.vector_norm((pixels - middle) / half, dim=-1)
         return ((_NONE - radius) / (_NONE - _FULL)).clamp(0.0, 1.0)
-
-
-def _flagged(status: Tensor, conditions: Sequence[tuple[Tensor, MatchStatus]]) -> Tensor:
-    """(N,) the status with the code of each condition (N,) in turn where it is true."""
-    for condition, code in conditions:
-        status = torch.where(condition, int(code), status)
-    return status
 
 
 def _brightest(image: Tensor, options: DisparityOptions) -> float:

@@ -17,6 +17,7 @@ from kcal.calibrate.problem.views import Views, poses_under, whitening
 from kcal.corners.observations import Observations
 from kcal.errors import InputError, KcalError
 from kcal.gaussian import triangular
+from kcal.io.foreign import camera_name
 from kcal.lens.calibration import CameraCalibration, LensSetting
 from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
@@ -384,7 +385,9 @@ def camera_at_setting(
     """
     if not cameras:
         raise InputError("camera_at_setting: no camera")
-    names = [_own_name(camera, i) for i, camera in enumerate(cameras)] if names is None else list(names)
+    names = (
+        [camera_name(camera, f"camera {i + 1}") for i, camera in enumerate(cameras)] if names is None else list(names)
+    )
     known = [
         usable_information(camera, cameras[0], name, names[0]) for camera, name in zip(cameras, names, strict=True)
     ]
@@ -428,7 +431,7 @@ def camera_at_setting(
     half = fit.errors(torch.cat(groups)[:, good])
     calibration, curve, setting_error, _ = half.split([*map(len, groups), len(half) - sum(map(len, groups))])
     fit.camera.calibration = CameraCalibration(
-        name=_own_name(cameras[0], 0),
+        name=camera_name(cameras[0], "camera 1"),
         covariance=half.T @ half,
         setting=LensSetting(values=dict(setting), interpolated_from=tuple(names)),
     )
@@ -470,10 +473,6 @@ def _calibrated(cameras: Sequence[Camera], number: int, known: CameraInformation
         setting_px=0.0,
         misfit_px=0.0,
     )
-
-
-def _own_name(camera: Camera, number: int) -> str:
-    return (camera.calibration.name if camera.calibration else "") or f"camera {number + 1}"
 
 
 # Compare lens models by views that were held out: a tool for research. A calibration needs no such choice.
