@@ -55,7 +55,7 @@ def warn_user(message: str) -> None:
 
 
 @contextmanager
-def with_extra(name: str, what: str, instead: str = "") -> Iterator[None]:
+def with_extra(name: str, what: str) -> Iterator[None]:
     """Import inside what an extra of kcal installs; without it, an `InputError` says how to.
 
     Example:
@@ -67,4 +67,4 @@ def with_extra(name: str, what: str, instead: str = "") -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise InputError(f"{what} {error.name}; install it with: pip install 'kcal[{name}]'{instead}") from error
+        raise InputError(f"{what} {error.name}; install it with: pip install 'kcal[{name}]'") from error

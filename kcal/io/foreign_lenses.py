@@ -301,7 +301,7 @@ def nearest_hybrid(
     camera, why = None, "its rim would be guessed"
     for reach in _REACHES:
         try:
-            camera, _ = hybrid_through(rays, pixels, like.size, reach)
+            camera = hybrid_through(rays, pixels, like.size, reach)
         except DegenerateError as refused:
             why = str(refused)
             continue
@@ -366,13 +366,11 @@ _SHAPES = torch.linspace(-1.0, 1.2, 221, dtype=torch.float64)
 _STEPS = 4
 
 
-def hybrid_through(
-    rays: Tensor, pixels: Tensor, size: tuple[int, int], reach: float = _REACHES[0]
-) -> tuple[Camera, Tensor]:
-    """The hybrid camera that comes nearest to pixels (N, 2) of rays (N, 3), and its errors (N, 2) in pixels.
+def hybrid_through(rays: Tensor, pixels: Tensor, size: tuple[int, int], reach: float) -> Camera:
+    """The hybrid camera that comes nearest to pixels (N, 2) of rays (N, 3).
 
     By least squares, without an entrance pupil. The rays should reach all over the image; those beyond `reach`, as a
-    share of the outermost one's distance in the lens's plane, are left out, and their errors.
+    share of the outermost one's distance in the lens's plane, are left out.
 
     Raises:
         DegenerateError: rays that no hybrid lens shows.
@@ -399,7 +397,7 @@ def hybrid_through(
         error = (pixels.T - found.pixels).reshape(-1, 1)
         values[free] += torch.linalg.lstsq(slopes / scale, error, driver="gelsd").solution[:, 0] / scale
     camera = Camera(values, size=size, model=model)
-    seen, shown = camera.project_rays(rays)
+    _, shown = camera.project_rays(rays)
     if not bool(shown.all()):
         raise DegenerateError(f"a hybrid lens shows only {float(shown.double().mean()):.1%} of these rays")
-    return camera, seen - pixels
+    return camera

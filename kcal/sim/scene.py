@@ -436,14 +436,12 @@ class DemoView(NamedTuple):
         name: of the view, for example "near-07".
         image: (height, width) uint8.
         corners: (N, 2) true pixels of the inner corners, row by row.
-        cam_from_board: true pose.
     """
 
     camera: Literal["left", "right"]
     name: str
     image: Tensor
     corners: Tensor
-    cam_from_board: Pose
 
 
 @functools.cache
@@ -630,7 +628,7 @@ def render_demo(scene: DemoScene, progress: Callable[[str], None] | None = None)
         corners, _ = captures.project_board(camera, pose, scene.near_board)
         if progress is not None:
             progress(f"{side} {name}")
-        yield DemoView(side, name, image, corners, pose)
+        yield DemoView(side, name, image, corners)
 
 
 def scene_views(scene: DemoScene) -> Iterator[tuple[Literal["left", "right"], str, Pose]]:
