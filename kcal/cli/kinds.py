@@ -90,7 +90,8 @@ Times = Annotated[
     str,
     Kind(
         metavar="TIME",
-        about="When, with its zone: 2026-11-24T20:47:26Z; name:Z or name:+02:00 reads it from each file's name.",
+        about="When (the middle of the exposure; of a video, its first frame), with its zone: 2026-11-24T20:47:26.5Z; "
+        "name:Z or name:+02:00 reads it from each file's name.",
     ),
 ]
 Time = Annotated[datetime.datetime, Kind(metavar="TIME", read=values.instant)]

@@ -409,14 +409,41 @@ def _decode(data: bytes, flags: int) -> npt.NDArray[Any] | None:
 
 # When an image was taken: from its name, or from what the camera wrote into it.
 
-# 20260501T120000, 2026-05-01_12-00-00 and the like, perhaps with a fraction of a second; or Unix seconds.
-DATE_IN_NAME = re.compile(r"(\d{4})-?(\d{2})-?(\d{2})[T_ -](\d{2})[-_:]?(\d{2})[-_:]?(\d{2})(?:\.(\d{1,6})(?!\d))?")
+# 20260501T120000, 2026-05-01_12-00-00 and the like, perhaps with a fraction of a second (of a telephone, 120000123) and
+# a zone; or Unix seconds.
+_DATE_IN_NAME = re.compile(
+    r"(\d{4})-?(\d{2})-?(\d{2})[T_ -](\d{2})[-_:]?(\d{2})[-_:]?(\d{2})(?:[.,](\d{1,9})(?!\d)|(\d{3})(?!\d))?"
+    r"(Z(?![A-Za-z])|\+[01]\d:?[0-5]\d(?!\d)|-[01]\d:[0-5]\d(?!\d))?"
+)
 _UNIX = re.compile(r"(?<![\d.])(1\d{9}(?:\.\d+)?)(?![\d])")
 _HEAD = 1 << 18
 
 
+def time_in_name(name: str) -> datetime.datetime | None:
+    """The time that the name of a file tells, with its zone if it has one; None: none.
+
+    Example:
+        >>> time_in_name("left_2026-05-01_12-00-00.250.png").isoformat()
+        '2026-05-01T12:00:00.250000'
+        >>> time_in_name("20260501T120000+0200.png").isoformat()
+        '2026-05-01T12:00:00+02:00'
+    """
+    found = _DATE_IN_NAME.search(name)
+    if found is None:
+        return None
+    fraction, zone = found[7] or found[8] or "0", found[9]
+    try:
+        time = datetime.datetime(*map(int, found.groups()[:6]))  # type: ignore[arg-type]
+    except ValueError:
+        return None
+    time += datetime.timedelta(seconds=float(f"0.{fraction}"))
+    return time.replace(tzinfo=datetime.datetime.strptime(zone, "%z").tzinfo if zone else None)
+
+
 def image_time(path: Path) -> float:
-    """Unix seconds at which an image was taken: from a date or Unix seconds in its name (UTC), or from EXIF.
+    """Unix seconds at which an image was taken: from a date or Unix seconds in its name, or from EXIF.
+
+    Without a zone, a time in a name is UTC.
 
     The time of the file is not taken: a copy has another one.
 
@@ -427,14 +454,8 @@ def image_time(path: Path) -> float:
         >>> image_time(Path("left_20260101T000000Z.png")), image_time(Path("right_1767225600.5.png"))
         (1767225600.0, 1767225600.5)
     """
-    if found := DATE_IN_NAME.search(path.name):
-        year, month, day, hour, minute, second = (int(part) for part in found.groups()[:6])
-        try:
-            moment = datetime.datetime(year, month, day, hour, minute, second, tzinfo=datetime.UTC)
-        except ValueError:
-            pass
-        else:
-            return moment.timestamp() + float(f"0.{found.group(7) or 0}")
+    if moment := time_in_name(path.name):
+        return moment.replace(tzinfo=moment.tzinfo or datetime.UTC).timestamp()
     if unix := _UNIX.search(path.name):
         return float(unix.group(1))
     try:

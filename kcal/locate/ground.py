@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kcal.errors import FileError, InputError, with_extra
 from kcal.files import read_head, read_text
-from kcal.locate.geodesy import mean_radius, place_enu
+from kcal.locate.geodesy import geodetic_to_ecef, place_enu
 from kcal.locate.views import StatedHeight
 from kcal.texts import brief
 
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 # Of a raster, 1.6 GB as they are kept.
 _MOST_CELLS = 200_000_000
 _MOST_TEXT = 1 << 31
+# Columns and rows from the middle cell to itself, to the next one in its row and in its column.
+_BESIDE = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _GRID_KEYS = {"ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "cellsize", "nodata_value"}
 
 
@@ -57,6 +59,11 @@ class Raster:
         return torch.from_numpy(self.between(*self.cells(lat.numpy(), lon.numpy())))
 
     @functools.cached_property
+    def most(self) -> float:
+        """Meters by which its ground is at most above or below the ellipsoid."""
+        return float(max(np.fmax.reduce(self.heights, None, initial=0), -np.fmin.reduce(self.heights, None, initial=0)))
+
+    @functools.cached_property
     def coarser(self) -> Raster:
         """The same ground in cells of twice the size, means of four; of an odd side the last cells are left out."""
         rows, columns = (side // 2 for side in self.heights.shape)
@@ -71,9 +78,41 @@ class Raster:
         x, y = lon, lat
         if self.into is not None:
             x, y = map(np.asarray, self.into.transform(x, y))
+        if self._middle_lon is not None:
+            # Of longitudes that mean the same, the one nearest to the raster's middle: it may reach beyond 180°.
+            x = x + 360.0 * np.round((self._middle_lon - x) / 360.0)
         column = self.to_cell[0] * x + self.to_cell[1] * y + self.to_cell[2] - 0.5
         row = self.to_cell[3] * x + self.to_cell[4] * y + self.to_cell[5] - 0.5
         return column, row
+
+    @functools.cached_property
+    def _middle_lon(self) -> float | None:
+        """Where a raster in degrees has its middle."""
+        if self.into is not None and not (self.into.target_crs and self.into.target_crs.is_geographic):
+            return None
+        rows, columns = self.heights.shape
+        return float(self.places(np.array([0.5 * columns]), np.array([0.5 * rows]))[0, 0])
+
+    def places(self, column: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(2, N) x and y of columns and rows (N,), counted from the first cell's corner."""
+        a, b, c, d, e, f = self.to_cell
+        return np.asarray(np.linalg.solve([[a, b], [d, e]], np.stack([column - c, row - f])), np.float64)
+
+    def on_earth(self, column: NDArray[np.float64], row: NDArray[np.float64]) -> Tensor:
+        """(N, 3) geocentric meters, on the ellipsoid, of columns and rows (N,), counted from the first cell's corner.
+
+        What lies outside of the coordinate system is not finite.
+        """
+        lon, lat = self.places(column, row)
+        if self.into is not None:
+            lon, lat = map(np.asarray, self.into.transform(lon, lat, direction="INVERSE"))
+        return geodetic_to_ecef(torch.from_numpy(np.stack([lat, lon, np.zeros_like(lat)], -1)))
+
+    def farthest(self, place: Tensor) -> float:
+        """Meters from a geocentric place (3,) to the farthest corner; not finite where that cannot be told."""
+        rows, columns = self.heights.shape
+        corners = self.on_earth(np.array([0.0, columns, 0.0, columns]), np.array([0.0, 0.0, rows, rows]))
+        return float(torch.linalg.vector_norm(corners - place, dim=-1).max())
 
     def between(self, column: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
         """Heights at columns and rows of `cells`, interpolated; NaN outside and beside unknown cells."""
@@ -137,23 +176,20 @@ def terrain(path: str | Path, geoid_height: float | None = None) -> Raster:
     into = None
     if not (system.is_geographic and pyproj.CRS("EPSG:4326").datum == system.datum):
         into = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
-    a, b, c, d, e, f = to_cell
-    # Not a number for cells without an area, which the checks below refuse.
-    per_area = (a * e - b * d) or math.nan
-    area = abs(1.0 / per_area)
-    sides = [math.hypot(e, d) * area, math.hypot(a, b) * area]
-    if system.is_geographic:
-        # y of the middle row.
-        lat = (a * (0.5 * heights.shape[0] - f) - d * (0.5 * heights.shape[1] - c)) / per_area
-        if not abs(lat) <= 90.0:
-            raise FileError(f"{path}: its middle row lies at latitude {lat:g}: at most 90 degrees are possible")
-        degree = math.radians(1.0) * mean_radius(lat)
-        sides = [sides[0] * degree * math.cos(math.radians(lat)), sides[1] * degree]
-    else:
-        sides = [side * system.axis_info[0].unit_conversion_factor for side in sides]
+    no_size = FileError(f"{path}: its cells have no size on the ground")
+    a, b, _, d, e, _ = to_cell
+    if not a * e - b * d or not math.isfinite(1.0 / (a * e - b * d)):
+        raise no_size
+    raster = Raster(heights, to_cell, into, math.nan)
+    # The middle, and a cell beside and below it.
+    column, row = (0.5 * side + np.array(steps) for side, steps in zip(heights.shape[::-1], _BESIDE, strict=True))
+    if system.is_geographic and not abs(lat := float(raster.places(column, row)[1, 0])) <= 90.0:
+        raise FileError(f"{path}: its middle row lies at latitude {lat:g}: at most 90 degrees are possible")
+    middle, *beside = raster.on_earth(column, row)
+    sides = [float(torch.linalg.vector_norm(place - middle)) for place in beside]
     if not 0.0 < min(sides) <= max(sides) < math.inf:
-        raise FileError(f"{path}: its cells have no size on the ground")
-    return Raster(heights, to_cell, into, min(sides))
+        raise no_size
+    return dataclasses.replace(raster, cell_m=min(sides))
 
 
 def _unit_of_heights(path: str | Path, unit: str, system: pyproj.CRS) -> float:
@@ -218,7 +254,7 @@ def _read_grid(path: Path) -> _Read:
         words = line[0].split()
         try:
             head[words[0].lower()] = value = float(words[1])
-            if not math.isfinite(value):
+            if not (math.isfinite(value) or words[0].lower() == "nodata_value"):
                 raise ValueError(words[1])
         except (ValueError, IndexError):
             raise FileError(f"{path}: {line[0].strip()!r} is no line of an ESRI ASCII grid's head") from None
@@ -254,8 +290,8 @@ def _read_grid(path: Path) -> _Read:
 
 # Height above the ellipsoid, meters, of latitudes and longitudes (degrees, of one shape); NaN where it is not known.
 Ground = Callable[[Tensor, Tensor], Tensor]
-# Rows of one search, so that steps along all lines fit into memory.
-_ROWS = 512
+# Steps within a cell of a raster, whose crests are as narrow as that; and of one search along several lines, by memory.
+_WITHIN, _SEARCHED = 8, 1 << 21
 # Steps of the search along a line of sight over a level surface, of equal ratio; then each is halved this often.
 _STEPS, _HALVINGS = 512, 50
 # Of a tangent that is found by differences, meters.
@@ -274,32 +310,47 @@ def level_ground(height: float) -> Ground:
     return lambda lat, lon: torch.full_like(lat, height)
 
 
+class Search(NamedTuple):
+    """Where lines of sight are held against the ground, going outward.
+
+    Attributes:
+        distances: (K,) increasing, from that of the camera.
+        heights: of the numbers (M,) of lines: (M, K) meters above the ground; NaN where that is not known.
+        cell: how many of the distances lie within the first cell of a raster.
+    """
+
+    distances: Tensor
+    heights: Callable[[Tensor], Tensor]
+    cell: int = 1
+
+
 def first_meeting(
-    along: Callable[[Tensor, Tensor], Tensor], above: Callable[[Tensor], Tensor], count: int, distances: Tensor
+    along: Callable[[Tensor, Tensor], Tensor], above: Callable[[Tensor], Tensor], count: int, search: Search
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Follow lines of sight outward until they are below the ground, or over ground that is not known.
 
     Args:
-        along: of distances (M, K) or (M,) and the numbers (M,) of lines: the places (..., 3) on these.
+        along: of distances (M,) and the numbers (M,) of lines: the places (M, 3) on these.
         above: height of places (..., 3) above the ground; NaN where that is not known.
-        count: N lines.
-        distances: (K,) increasing from that of the camera.
+        count: N lines, at least one.
+        search: the places that are looked at first.
 
     Returns:
         Which lines (N,) meet the ground, where (N, 3) they do so first, and the slope (N, 3) of the height above the
         ground by the place.
     """
-    parts = []
-    for rows in torch.arange(count).split(_ROWS):
-        heights = above(along(distances.expand(len(rows), -1), rows))
+    parts, distances = [], search.distances
+    for rows in torch.arange(count).split(max(1, _SEARCHED // len(distances))):
+        heights = search.heights(rows)
         # The first place that is not above known ground ends the search, but not one where a raster buries the camera.
         ended = ~(heights > 0)
-        buried, ended[:, 0] = ended[:, 0].clone(), False
+        buried = ended[:, :1].clone()
+        ended[:, : search.cell] &= ~buried
         first = torch.where(ended.any(1), ended.to(torch.int8).argmax(1), 0)
-        met = ended.any(1) & torch.isfinite(heights.gather(1, first[:, None])[:, 0]) & (first > buried)
+        met = torch.isfinite(heights.gather(1, first[:, None])[:, 0]) & (first > search.cell * buried[:, 0])
         parts.append((distances[first], distances[(first - 1).clamp_min(0)], met))
-    far, near, met = (torch.cat(part) for part in zip(*parts, strict=True)) if parts else (torch.zeros(0),) * 3
-    rows, met = torch.arange(count), met.bool()
+    far, near, met = (torch.cat(part) for part in zip(*parts, strict=True))
+    rows = torch.arange(count)
     for _ in range(_HALVINGS):
         middle = 0.5 * (near + far)
         high = above(along(middle, rows)) > 0
@@ -382,6 +433,9 @@ def _ground_ahead(
 ) -> StatedHeight:
     """Where rays (N, 3) from places of cameras meet the ground for the first time, of those that are `alone`."""
     wanted = alone.nonzero()[:, 0]
+    point, normal, met = place + ray, torch.zeros_like(place), torch.zeros_like(alone)
+    if not len(wanted):
+        return StatedHeight(point, normal, torch.full_like(place[:, 0], sigma), met)
     start, sight, up = place[wanted], ray[wanted], first[wanted].to(torch.float64) @ frame.up
     bent = frame.refraction * frame.half_curvature * (1.0 - (sight * up).sum(-1).square())
     anchored = frame.ecef_from_enu, frame.ecef_of_origin
@@ -395,16 +449,33 @@ def _ground_ahead(
         lat, lon, height = place_enu(points, *anchored).unbind(-1)
         return height - ground(lat, lon)
 
-    # In equal steps, or in growing ones over level ground.
-    step = getattr(ground, "cell_m", None)
-    distances = torch.arange(0.0, _FARTHEST + step, step, dtype=torch.float64) if step else _GROWING
-    reached, there, slope = first_meeting(along, above, len(wanted), distances)
-    met = torch.zeros_like(alone)
+    def heights_over(raster: Raster, distances: Tensor, rows: Tensor) -> Tensor:
+        lat, lon, height = place_enu(along(distances.expand(len(rows), -1), rows), *anchored).unbind(-1)
+        column, row = map(torch.from_numpy, raster.cells(lat.numpy(), lon.numpy()))
+        # From the last column to the first one, where a raster goes around the Earth.
+        column[column.diff(prepend=column[:, :1]).abs() > max(0.5 * raster.heights.shape[1], 16)] = math.nan
+        column, row, height = map(_subdivided, (column, row, height))
+        return height - torch.from_numpy(raster.between(column.numpy(), row.numpy()))
+
+    search = Search(_GROWING, lambda rows: above(along(_GROWING.expand(len(rows), -1), rows)))
+    if isinstance(ground, Raster):
+        # No farther than the raster reaches.
+        away = float(torch.linalg.vector_norm(start, dim=-1).max()) + ground.most
+        away += ground.farthest(frame.ecef_of_origin)
+        cell = ground.cell_m
+        coarse = torch.arange(0.0, (away if away < _FARTHEST else _FARTHEST) + 2.0 * cell, cell, dtype=torch.float64)
+        search = Search(_subdivided(coarse), functools.partial(heights_over, ground, coarse), _WITHIN)
+    reached, there, slope = first_meeting(along, above, len(wanted), search)
     met[wanted] = reached
-    point, normal = place + ray, torch.zeros_like(place)
     point[wanted] = torch.where(reached[:, None], there, point[wanted])
     normal[wanted] = torch.where(reached[:, None], slope, 0.0)
     return StatedHeight(point, normal, torch.full_like(place[:, 0], sigma), met)
+
+
+def _subdivided(values: Tensor) -> Tensor:
+    """Values (..., K) in steps of a cell, and between them (..., 8 (K - 1))."""
+    part = torch.arange(_WITHIN, dtype=torch.float64) / _WITHIN
+    return values[..., :-1, None].lerp(values[..., 1:, None], part).flatten(-2)
 
 
 def _height_ahead(

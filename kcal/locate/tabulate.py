@@ -122,8 +122,11 @@ def true_from_grid(grid_heading_deg: float, origin: Origin, crs: str) -> float:
     if not system.is_projected:
         raise InputError(f"{crs}: {system.name} has no grid; a projected system such as EPSG:32643 is needed")
     try:
-        # The azimuth of grid north from true north.
-        grid_north = pyproj.Proj(system).get_factors(origin.lon, origin.lat, errcheck=True).meridian_convergence
+        # The azimuth of grid north from true north; longitudes count from the system's own meridian, such as Paris.
+        meridian = system.prime_meridian
+        first = math.degrees(meridian.longitude * float(meridian.unit_conversion_factor)) if meridian else 0.0
+        factors = pyproj.Proj(system).get_factors(origin.lon - first, origin.lat, errcheck=True)
+        grid_north = factors.meridian_convergence
     except ProjError as error:
         raise InputError(f"{crs}: {system.name} does not reach {origin.lat:g}, {origin.lon:g}") from error
     area = system.area_of_use

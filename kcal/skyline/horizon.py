@@ -415,7 +415,8 @@ class TerrainRays:
         self.raster, self.eye = raster, eye
         self.radius = mean_radius(eye.lat)
         self.bending = refraction / (2.0 * self.radius)
-        self.farthest = min(_farthest(raster, eye), _FARTHEST)
+        away = raster.farthest(geodetic_to_ecef(eye.geodetic))
+        self.farthest = away if away < _FARTHEST else _FARTHEST
         self._place = anchor(eye)
         self._nodes = 0.5 * self.farthest * (1.0 - np.cos(math.pi * (np.arange(_NODES) + 0.5) / _NODES))
 
@@ -452,19 +453,6 @@ class TerrainRays:
         """(A, S, 3) where heights at distances stand, east, north, up of the eye."""
         place = self.joined(nodes[:, 2:], distance)
         return np.moveaxis(place[:, :3] + height[:, None] * place[:, 3:], 1, 2)
-
-
-def _farthest(raster: Raster, eye: Origin) -> float:
-    """Meters to the raster's farthest corner."""
-    rows, columns = raster.heights.shape
-    a, b, c, d, e, f = raster.to_cell
-    corner = np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]], dtype=np.float64)
-    xy = np.linalg.solve([[a, b], [d, e]], (corner - [c, f]).T)
-    lon, lat = xy if raster.into is None else map(np.asarray, raster.into.transform(xy[0], xy[1], direction="INVERSE"))
-    if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
-        return _FARTHEST
-    geodetic = torch.from_numpy(np.stack([lat, lon, np.full(4, eye.height)], -1))
-    return float(torch.linalg.vector_norm(geodetic_to_ecef(geodetic) - geodetic_to_ecef(eye.geodetic), dim=-1).max())
 
 
 def _chebyshev_weights(nodes: Floats, at: Floats) -> Floats:

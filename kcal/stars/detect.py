@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from kcal.corners.images import DATE_IN_NAME, VIDEO_SUFFIXES, expand_images, read_gray
-from kcal.corners.video import read_frames
+from kcal.corners.images import VIDEO_SUFFIXES, expand_images, read_gray, time_in_name
+from kcal.corners.video import VideoFrames, read_frames
 from kcal.errors import FileError, InputError
 from kcal.files import read_bytes
 from kcal.stars.sky import EARTH_RATE, StarCatalog
@@ -254,8 +254,11 @@ def expand_nights(inputs: list[str]) -> list[Path]:
 def time_of(text: str | None, path: Path) -> datetime.datetime | None:
     """When an image was taken: `text` itself, or what its name says where the text is `name:Z` or `name:+02:00`.
 
+    What is told is the middle of the exposure. Of a video it is the first frame, and what comes back is the middle of
+    the frames that are summed.
+
     Raises:
-        InputError: no zone, or a name without a time.
+        InputError: no zone, a name without a time, or one with another zone.
 
     Example:
         >>> time_of("name:Z", Path("2019-07-29T204726_Alt40.png")).isoformat()
@@ -265,14 +268,26 @@ def time_of(text: str | None, path: Path) -> datetime.datetime | None:
         return None
     kind, _, zone = text.partition(":")
     if kind != "name":
-        return instant(text, "time")
+        return instant(text, "time") + _to_middle(path)
     if not zone:
         raise InputError("--time name: say the zone of the times in the names, name:Z for UTC or name:+02:00")
-    found = DATE_IN_NAME.search(path.name)
+    found = time_in_name(path.name)
     if found is None:
         raise InputError(f"{path.name}: no time in this name; it should be like 2026-11-24T204726")
-    year, month, day, hour, minute, second = found.groups()[:6]
-    return instant(f"{year}-{month}-{day}T{hour}:{minute}:{second}{zone}", "time")
+    time = instant(f"{found.replace(tzinfo=None).isoformat()}{zone}", "time")
+    if found.tzinfo is not None and found != time:
+        raise InputError(f"{path.name}: the zone in this name is not that of --time {text}")
+    return time + _to_middle(path)
+
+
+def _to_middle(path: Path) -> datetime.timedelta:
+    """From the first frame that `read_night` sums to the middle of them."""
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        return datetime.timedelta(0)
+    frames = VideoFrames(path)
+    if not 0 < frames.rate < math.inf:
+        raise FileError(f"{path}: the video does not say how many frames a second it has; write one as PNG")
+    return datetime.timedelta(seconds=0.5 * (min(frames.count, _MOST_FRAMES) - 1) / frames.rate)
 
 
 # How many stars a camera will see, how well, and what range error follows: before anyone climbs the mast.

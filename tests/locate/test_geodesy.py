@@ -269,6 +269,14 @@ def test_grid_north_is_not_true_north() -> None:
     assert (e1 - e0) / (n1 - n0) == pytest.approx(0.01215, abs=1e-5)
     assert true_from_grid(12.0, Origin(lat=19.07, lon=75.0, height=0.0), "EPSG:32643") == pytest.approx(12.0, abs=1e-9)
     east = Origin(lat=19.07, lon=77.0, height=0.0)
+    # Longitudes of these count from Paris (in grads), Bern, Rome, Oslo.
+    for crs, lat, lon in (("EPSG:27572", 46.0, 6.5), ("EPSG:21780", 46.5, 9.0), ("EPSG:26591", 45.5, 8.5),
+                          ("EPSG:27393", 60.0, 10.8), ("EPSG:2154", 46.0, 6.5)):  # fmt: skip
+        grid = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+        x, y = grid.transform(lon, lat)
+        north = grid.transform(x, y + 200.0, direction="INVERSE")
+        azimuth = pyproj.Geod(ellps="WGS84").inv(lon, lat, *north)[0]
+        assert true_from_grid(0.0, Origin(lat=lat, lon=lon, height=0.0), crs) == pytest.approx(azimuth, abs=0.01), crs
     assert true_from_grid(359.9, east, "EPSG:32643") == pytest.approx(0.553, abs=1e-3)
     with pytest.warns(KcalWarning, match=r"longitudes 78 to 84, not for 19.07, 72.87, .* -2.67° from true north"):
         assert true_from_grid(90.0, mumbai, "EPSG:32644") == pytest.approx(87.335, abs=0.01)

@@ -12,7 +12,7 @@ import torch
 
 from kcal import Camera, FileError, InputError, Localizer, Origin, PositionStatus, Rig, locate_points
 from kcal.locate import Marks, enu_from_cam, geodetic_to_enu, level_ground, terrain
-from kcal.locate.ground import Ground
+from kcal.locate.ground import Ground, Raster
 from kcal.locate.localizer import Localization
 from kcal.rig import Mounting, mounting_covariance, station_rig
 
@@ -141,6 +141,50 @@ def test_ground_in_the_first_cell_is_found(tmp_path: Path) -> None:
     flat = on_ground(stands(), pixels, terrain(tmp_path / "flat.asc"), 0.3)
     torch.testing.assert_close(flat.enu, on_ground(stands(), pixels, level_ground(10.0), 0.3).enu, rtol=0, atol=1e-3)
     assert on_ground(stands(), pixels, terrain(tmp_path / "flat.asc", 51.0), 0.3).status.tolist() == [6]
+
+
+def test_a_crest_of_one_row_of_cells_is_met(tmp_path: Path) -> None:
+    """By lines of sight that pass below it for less than a cell; of a map whose meters are half as long, too."""
+    grid = "ncols 9\nnrows 60\ncellsize {}\nxllcorner {}\nyllcorner {}\n" + "10 10 10 10 10 10 10 10 10\n" * 29
+    rows = grid + "48 48 48 48 48 48 48 48 48\n" + "10 10 10 10 10 10 10 10 10\n" * 30
+    (tmp_path / "degrees.asc").write_text(rows.format(0.001, ORIGIN.lon - 0.0045, ORIGIN.lat - 0.0235))
+    north = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:3857", always_xy=True).transform(ORIGIN.lon, ORIGIN.lat)
+    (tmp_path / "map.asc").write_text(rows.format(100.0, north[0] - 450.0, north[1] - 2350.0))
+    (tmp_path / "map.prj").write_text(pyproj.CRS("EPSG:3857").to_wkt())
+    level = stands(heading_deg=0.0, pitch_deg=0.0, roll_deg=0.0)
+    # The crest is 7 cells to the north; the camera is at 60 m.
+    true = torch.tensor([[0.0, 600.0, -up] for up in (12.5, 13.5, 15.0, 18.0, 21.0)]).double()
+    for name, cell in (("degrees.asc", 110.7), ("map.asc", 100.0 * math.cos(math.radians(ORIGIN.lat)))):
+        ground = terrain(tmp_path / name)
+        assert ground.cell_m == pytest.approx(min(cell, 105.3), rel=0.02)
+        found = on_ground(level, pixels_of(level, true), ground, 0.3)
+        far = 7.0 * cell
+        assert found.status.tolist() == [0] * 5
+        assert bool((found.enu[:, 1] - far).abs().lt(cell).all()), found.enu[:, 1]
+
+
+def test_ground_on_both_sides_of_the_antimeridian(tmp_path: Path) -> None:
+    """As GDAL writes it, to longitudes beyond 180°, and with longitudes of 0 to 360°."""
+    for first, lons in ((179.5, (179.9, -179.9)), (-180.5, (179.9, -179.9)), (355.0, (-4.9, 355.1))):
+        (tmp_path / "both.asc").write_text(
+            f"ncols 10\nnrows 10\nxllcorner {first}\nyllcorner -17.5\ncellsize 0.1\n" + ("7 " * 10 + "\n") * 10
+        )
+        (tmp_path / "both.prj").write_text(pyproj.CRS("EPSG:4326").to_wkt())
+        ground = terrain(tmp_path / "both.asc")
+        assert ground(torch.full((2,), -17.0).double(), torch.tensor(lons).double()).tolist() == pytest.approx([7, 7])
+
+
+def test_a_fine_raster_is_searched_no_farther_than_it_reaches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A window of a few cells of a decimeter is no table of 600,000 places for each line of sight."""
+    (tmp_path / "fine.asc").write_text(
+        f"ncols 9\nnrows 9\nxllcorner {ORIGIN.lon}\nyllcorner {ORIGIN.lat}\ncellsize 0.000001\n"
+        + ("10 " * 9 + "\n") * 9
+    )
+    sizes: list[int] = []
+    asked = Raster.cells
+    monkeypatch.setattr(Raster, "cells", lambda self, lat, lon: sizes.append(lat.size) or asked(self, lat, lon))
+    assert on_ground(stands(), torch.zeros(1, 2).double(), terrain(tmp_path / "fine.asc"), 0.3).status.tolist() == [6]
+    assert 0 < max(sizes) < 5000
 
 
 def test_a_camera_below_the_terrain_or_beside_it_is_named(tmp_path: Path) -> None:

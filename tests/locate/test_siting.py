@@ -215,6 +215,9 @@ def test_ascii_grids_need_no_other_package(tmp_path: Path) -> None:
     torch.testing.assert_close(again, found, equal_nan=True, rtol=0, atol=1e-6)
     empty = terrain(grid(tmp_path, head, "1 2\n3 5\n7 -9999\n"))
     assert empty(*torch.tensor([lat, lon], dtype=torch.float64)).isnan().tolist() == [False, True, False, True]
+    # As GDAL writes a raster that marks what is not known with NaN.
+    empty = terrain(grid(tmp_path, head.replace("-9999", "nan"), "1 2\n3 5\n7 nan\n"))
+    assert empty(*torch.tensor([lat, lon], dtype=torch.float64)).isnan().tolist() == [False, True, False, True]
 
 
 def test_ascii_grids_in_meters_need_their_coordinate_system(tmp_path: Path) -> None:
@@ -228,7 +231,8 @@ def test_ascii_grids_in_meters_need_their_coordinate_system(tmp_path: Path) -> N
     ground = terrain(path)
     lon, lat = pyproj.Transformer.from_crs("EPSG:32643", "EPSG:4326", always_xy=True).transform(275_010.0, 2_110_020.0)
     assert ground(*torch.tensor([[lat], [lon]], dtype=torch.float64)).tolist() == pytest.approx([2.75], abs=1e-3)
-    assert ground.cell_m == pytest.approx(10.0)
+    scale = pyproj.Proj("EPSG:32643").get_factors(lon, lat).meridional_scale
+    assert ground.cell_m == pytest.approx(10.0 / scale, rel=1e-6)
     for wrong, text in (
         (head.replace("nrows 3", "nrows 4"), "6 heights"), (head.replace("ncols 2\n", ""), "the line ncols"),
         (head.replace("cellsize 10", "cellsize"), "no line of"), (head + "hill\n", "must be numbers"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -127,6 +128,16 @@ class TestFiles:
         gray = np.arange(768, dtype=np.uint16).reshape(24, 32) * 80
         assert np.array_equal(read_night(write_png(tmp_path / "b.png", gray)), gray)
 
+    def test_of_a_video_the_first_frame_is_told_and_the_middle_is_meant(self, tmp_path: Path) -> None:
+        frame = np.full((32, 48), 10, np.uint8)
+        first = datetime.datetime(2026, 11, 24, 8, 47, 26, tzinfo=datetime.UTC)
+        for count, summed in ((9, 9), (130, 100)):
+            path = write_video(tmp_path / "2026-11-24T084726.avi", itertools.repeat(frame, count), 25)
+            for text in ("name:Z", "2026-11-24T08:47:26Z"):
+                time = time_of(text, path)
+                assert time is not None
+                assert (time - first).total_seconds() == pytest.approx((summed - 1) / 2 / 25)
+
     def test_files_folders_and_wildcards(self, tmp_path: Path) -> None:
         for name in ("b.png", "a.png", "c.fits", "d.mp4"):
             (tmp_path / name).touch()
@@ -142,7 +153,14 @@ class TestFiles:
         assert time_of("name:Z", Path("20260102-030405.png")) == datetime.datetime(
             2026, 1, 2, 3, 4, 5, tzinfo=datetime.UTC
         )
-        for text, path, message in (("name", image, "zone"), ("name:Z", Path("a.png"), "no time in this name")):
+        half = time_of("name:Z", Path("2026-11-24T084726.750.png"))
+        assert half == datetime.datetime(2026, 11, 24, 8, 47, 26, 750_000, tzinfo=datetime.UTC)
+        zoned = Path("20261124T104726+0200.png")
+        assert time_of("name:+02:00", zoned) == datetime.datetime(2026, 11, 24, 8, 47, 26, tzinfo=datetime.UTC)
+        for text, path, message in (
+            ("name", image, "zone"), ("name:Z", Path("a.png"), "no time in this name"),
+            ("name:Z", zoned, "the zone in this name is not that of --time name:Z"),
+        ):  # fmt: skip
             with pytest.raises(InputError, match=message):
                 time_of(text, path)
 

@@ -31,6 +31,8 @@ from kcal.io.camera_file import CameraFile
 from kcal.native_file import NativeFile
 from kcal.threads import work_limit
 
+# Finished pieces of work, in the folder of the results.
+WORK = ".work"
 _COLUMNS = ("camera", "images", "board", "square", "model")
 
 
@@ -100,7 +102,8 @@ def read_jobs(source: Path, board: Board | None, model: str, square: str | None 
         rows = [
             {"camera": folder.name, "images": str(folder)}
             for folder in sorted(source.iterdir())
-            if folder.is_dir() and not folder.name.startswith(".")
+            # Results of a batch are no camera.
+            if folder.is_dir() and not folder.name.startswith(".") and not (folder / WORK).is_dir()
         ]
         if not rows:
             raise FileError(f"{source}: no folders in it; make one folder of images for each camera, or give a CSV")

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from kcal.calibrate.batch.jobs import (
+    WORK,
     BatchOptions,
     Calibrated,
     CameraJob,
@@ -150,7 +151,7 @@ class Results:
     def __init__(self, folder: Path, jobs: Sequence[CameraJob], options: BatchOptions) -> None:
         self.folder, self.jobs, self.options = folder, jobs, options
         self.reused = 0
-        self._work = make_folder(folder / ".work")
+        self._work = make_folder(folder / WORK)
         self._advance: Callable[[str], None] = lambda _: None
         self._pieces: list[list[Detected | None]] = [[None] * len(job.images) for job in jobs]
         self._digests: list[list[str]] = [[""] * len(job.images) for job in jobs]
@@ -166,6 +167,8 @@ class Results:
         """Yield what is left to do, image after image; `advance` is called after each piece of work."""
         self._advance = advance
         for number, job in enumerate(self.jobs):
+            if job.error:
+                self._remove_old(number)
             for i, path in enumerate(job.images):
                 yield from self._image(number, i, path)
 
@@ -212,7 +215,7 @@ class Results:
             self._finish(number, Calibrated(error=str(error)))
             return []
         self._views[number] = seen
-        seen.save(self.folder / f"{job.name}.obs.json")
+        seen.save(self._file(number, "obs"))
         key = hash_of("calibrated", job.name, job.model, self.options.board_warp, seen.dump())
         kept = self._load(Calibrated, key)
         if kept is not None:
@@ -221,18 +224,26 @@ class Results:
         return [Task(("camera", number, 0, key), calibrate_observations, (seen, job.name, job.model, self.options))]
 
     def _finish(self, number: int, result: Calibrated) -> None:
-        path = self.folder / f"{self.jobs[number].name}.camera.json"
         self._calibrated[number] = result
         if result.camera is not None:
-            result.camera.save(path)
+            result.camera.save(self._file(number, "camera"))
         else:
-            path.unlink(missing_ok=True)  # of an earlier run with other images: not this one's result
+            self._remove_old(number)
         self._pieces[number].clear()
         if number not in self._share:
             self._rows[number] = self._row(number, self.jobs[number])
             del self._calibrated[number]
             self._views.pop(number, None)
         self._advance(self.jobs[number].name)
+
+    def _file(self, number: int, kind: str) -> Path:
+        return self.folder / f"{self.jobs[number].name}.{kind}.json"
+
+    def _remove_old(self, number: int) -> None:
+        """Remove what is of an earlier run with other images; of images that come back it is made again at once."""
+        self._file(number, "camera").unlink(missing_ok=True)
+        if number not in self._views:
+            self._file(number, "obs").unlink(missing_ok=True)
 
     def share(self, numbers: Sequence[int], crew: Pool) -> None:
         """Calibrate cameras that may have seen one board again, each with the board as the others measured it."""

@@ -199,6 +199,14 @@ class TestResults:
             (folder / "east" / f"{i}.png").unlink()
         assert run(folder, place / "out")[0][0].status == "failed"
         assert not (place / "out" / "east.camera.json").exists()
+        for path in (folder / "east").iterdir():
+            path.unlink()
+        assert "no image in this folder" in run(folder, place / "out")[0][0].error
+        assert [path.name for path in (place / "out").glob("east.*")] == []
+
+    def test_results_inside_the_folder_are_no_camera(self, folder):
+        run(folder, folder / "results")
+        assert [job.name for job in read_jobs(folder, BOARD, "opencv5")] == ["east", "west"]
 
 
 class TestSharing:
