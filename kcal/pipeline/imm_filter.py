@@ -39,26 +39,32 @@ class Motion:
         acceleration: white noise of the acceleration, m/s² in a band of 1 Hz.
         turn_rate: radians per second to the left, as seen from above.
         memory_s: seconds in which a velocity is forgotten; infinite: it stays.
+        fast: how many times `TrackOptions.speed_mps` the velocity of a new target is that moves so, across the line of
+            sight and along it.
 
     Raises:
-        InputError: a noise that is negative or not finite, or a memory that is not positive.
+        InputError: a noise that is negative or not finite, or a memory or a number of times that is not positive.
     """
 
     acceleration: float
     turn_rate: float = 0.0
     memory_s: float = math.inf
+    fast: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
-        if not (0 <= self.acceleration < math.inf and math.isfinite(self.turn_rate) and self.memory_s > 0):
+        finite = math.isfinite(self.turn_rate) and all(0 < times < math.inf for times in self.fast)
+        if not (0 <= self.acceleration < math.inf and finite and self.memory_s > 0):
             raise InputError("motion: a finite noise, not negative, a finite rate and a positive memory are needed")
 
 
-STRAIGHT = Motion(acceleration=0.3)
+# New targets are slow, or aircraft at 150 m/s. What crosses slowly may still come fast: the first sightings tell how it
+# crosses, and much later ones whether it comes.
+STRAIGHT = Motion(acceleration=0.3, fast=(1.0, 10.0))
 MOTIONS = (
     Motion(acceleration=0.3, memory_s=1.0),
     STRAIGHT,
-    Motion(acceleration=2.0, turn_rate=0.2),
-    Motion(acceleration=2.0, turn_rate=-0.2),
+    Motion(acceleration=2.0, turn_rate=0.2, fast=(10.0, 10.0)),
+    Motion(acceleration=2.0, turn_rate=-0.2, fast=(10.0, 10.0)),
 )
 
 
@@ -462,8 +468,15 @@ def updated(beliefs: Beliefs, found: Innovations, root: Tensor | None) -> Belief
     return Beliefs(mean, columns, late, torch.softmax(log, 0).clamp_min(1e-12))
 
 
-def born(seen: Anchored, timing: Timing, speed: float, models: int) -> Beliefs:
-    """Beliefs from one sighting each, with velocities of zero and a standard deviation of `speed` along each axis."""
+def born(seen: Anchored, timing: Timing, speeds: Tensor) -> Beliefs:
+    """Beliefs from one sighting each, with velocities of zero.
+
+    Args:
+        seen: N sightings in the tracks' frames.
+        timing: of the sightings.
+        speeds: (2, J) standard deviations of the velocity across the line of sight and along it, meters per second, of
+            each model.
+    """
     slope = seen.late.sum(0)
     normal = product(slope.transpose(0, 1), slope)
     still = torch.eye(3, dtype=slope.dtype, device=slope.device)[..., None]
@@ -473,17 +486,20 @@ def born(seen: Anchored, timing: Timing, speed: float, models: int) -> Beliefs:
     state = torch.cat([place, torch.zeros_like(place)])
     late = by_rates(product(gain, (seen.late * timing.delay[:, None, None]).sum(0)), state)[:, 3:]
     # The range is hardly known at first, but a speed per meter of range must not vanish.
-    drift = speed**2 * (place[2].square() + spread[2, 2])
-    here, by_clock = spread + drift * squared(late), []
+    pace = speeds[[0, 0, 1], :, None] * (place[2].square() + spread[2, 2]).sqrt()  # (3, J, N)
+    here, by_clock = spread[..., None, :] + squared(late[..., None, :] * pace), []
     for which in range(len(timing.clock)):
         by_camera = by_rates(product(gain, seen.late[1 + which]), state)[:, 3:]
-        here = here + drift * timing.unsure[which].square() * squared(by_camera)
+        here = here + squared((timing.unsure[which] * by_camera)[..., None, :] * pace)
         by_clock.append(by_camera[:, None] * timing.clock[which, :, None])
-    pace, both = still * drift, -drift * late
-    noise = torch.cat([torch.cat([here, both], 1), torch.cat([both.transpose(0, 1), pace], 1)])
+    both = -late[..., None, :] * pace.square()
+    noise = torch.cat([
+        torch.cat([here, both], 1), torch.cat([both.transpose(0, 1), still[..., None] * pace.square()], 1)
+    ])  # fmt: skip
     shared = torch.nn.functional.pad(product(gain, seen.shared), (0, 0, 0, 0, 0, 3))
     clocks = torch.cat(by_clock, 1) if by_clock else state.new_zeros(3, 0, *late.shape[1:])
     clocks = torch.nn.functional.pad(-clocks, (0, 0, 0, 0, 0, 0, 0, 3))
-    columns = torch.cat([noise, -shared], 1)
-    state, columns, clocks = (value[..., None, :].repeat_interleave(models, -2) for value in (state, columns, clocks))
+    models = speeds.shape[1]
+    state, shared, clocks = (value[..., None, :].repeat_interleave(models, -2) for value in (state, -shared, clocks))
+    columns = torch.cat([noise, shared], 1)
     return Beliefs(state, columns, clocks, state.new_full((models, place.shape[-1]), 1.0 / models))

@@ -35,7 +35,7 @@ class TrackOptions:
     Args:
         motions: models among which each track may switch.
         switch_s: mean time between switches, seconds.
-        speed_mps: standard deviation of a new target's velocity along each axis.
+        speed_mps: standard deviation of a new target's velocity along each axis, times `fast` of each motion.
         confirm_hits: sightings after which a track is told of; twice as many if its pairs are ambiguous.
         lose_after_s: seconds without a sighting after which a track is told of no more.
         forget_after_s: seconds without a sighting in which it may still be recognized by its motion.
@@ -602,7 +602,8 @@ class Tracker:
         ray = torch.nn.functional.normalize(seen.direction.T, dim=-1)
         frame = torch.stack([*side_axes(ray), ray]).movedim(-1, 1)
         local = anchored(seen, frame, seen.place)
-        new = imm.born(local, timing.at(which), self.options.speed_mps, len(self.options.motions))
+        speeds = self.options.speed_mps * ray.new_tensor([motion.fast for motion in self.options.motions]).T
+        new = imm.born(local, timing.at(which), speeds)
         self.beliefs = imm.Beliefs(*(torch.cat(both, -1) for both in zip(self.beliefs, new, strict=True)))
         self.frame, self.home = torch.cat([self.frame, frame], -1), torch.cat([self.home, seen.anchor])
         for i in which.tolist():

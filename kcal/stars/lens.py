@@ -503,7 +503,7 @@ def _star_fields(
     for number, rotation in sorted(rotations.items()):
         found, directions = images[number], _directions(views[number], catalog)
         # At another time the axes are the same, but aberration and refraction move stars by some seconds of arc.
-        ahead = _ahead(rotation, directions, catalog)
+        ahead = _ahead(rotation, directions, catalog, views[number])
         best = fit_attitude(found.pixels, found.sigma, directions, catalog.magnitude, camera, ahead)
         if best is None:
             continue
@@ -523,6 +523,6 @@ def _directions(view: SkyView, catalog: StarCatalog) -> np.ndarray:
     return np.where(up[:, None], there @ turn_between(there[up], celestial[up]).T, celestial)
 
 
-def _ahead(rotation: np.ndarray, directions: np.ndarray, catalog: StarCatalog) -> np.ndarray:
+def _ahead(rotation: np.ndarray, directions: np.ndarray, catalog: StarCatalog, view: SkyView) -> np.ndarray:
     near = catalog.directions() @ rotation[2] > 0.95
     return rotation @ turn_between(directions[near], catalog.directions()[near]) if near.sum() > 2 else rotation

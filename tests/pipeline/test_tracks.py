@@ -48,7 +48,9 @@ def test_one_sighting_is_what_the_localizer_says() -> None:
     frame = ((turned * torch.sign(turned.diagonal())).T @ localize.enu_from_rig.T).expand(4, 3, 3)
     timing = Timing(torch.zeros(2, 4).double(), torch.zeros(0, 3, 4).double(), torch.zeros(0, 4).double())
     local = anchored(seen, frame.movedim(0, -1), seen.place)
-    found = track_states(stations, frame, seen.anchor, born(local, timing, 10.0, 1).summary(), None)
+    found = track_states(
+        stations, frame, seen.anchor, born(local, timing, torch.full((2, 1), 10.0).double()).summary(), None
+    )
     assert found.status.tolist() == expected.status.tolist() == [0, 0, 0, 6]
     # Rows are linear around the place where the lines of sight meet; the localizer goes on to the optimum.
     error = (found.inverse_range - expected.inverse_range) / expected.inverse_range_sigma
