@@ -1,7 +1,5 @@
 """What all tests share: where real data lie, and repeatable property tests."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections import Counter

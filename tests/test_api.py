@@ -1,7 +1,5 @@
 """What kcal promises to its users: the names in `kcal` and its namespaces."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import inspect

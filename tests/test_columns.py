@@ -1,7 +1,5 @@
 """The page of columns, and quantities as texts."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import re

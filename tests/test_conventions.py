@@ -1,7 +1,5 @@
 """Conventions, and checks of arguments."""
 
-from __future__ import annotations
-
 import ast
 import math
 import re

@@ -1,7 +1,5 @@
 """The pages name only what exists: links, pictures, scripts, files and functions."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import importlib.util

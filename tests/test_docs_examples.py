@@ -1,7 +1,5 @@
 """Examples of the pages: Python blocks run and pass a strict type check, commands are accepted by the command line."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

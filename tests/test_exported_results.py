@@ -1,7 +1,5 @@
 """Programs of `torch.export` are saved and loaded with the named tuples that modules return."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import io

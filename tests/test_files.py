@@ -1,7 +1,5 @@
 """Files: atomic writing, kinds and locks."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import math

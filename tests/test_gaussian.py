@@ -1,7 +1,5 @@
 """Gaussians as square roots of information agree with dense covariances, however they are stacked, cut and ordered."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The judge of held-out views: what it forgives a camera, and what not."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Heads of image files."""
 
-from __future__ import annotations
-
 import io
 import struct
 import subprocess

@@ -1,7 +1,5 @@
 """The house keeps its rooms and floors: imports point downward, without circles; few rooms know foreign libraries."""
 
-from __future__ import annotations
-
 import ast
 import graphlib
 from pathlib import Path

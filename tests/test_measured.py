@@ -1,7 +1,5 @@
 """Commands on the measured pages exist as they are written there, and each page says what they need."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 import functools

@@ -1,7 +1,5 @@
 """Every `nn.Module` of the package: derivatives, batches, states, copies, vmap, devices, and the page about them."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Checks of the tests themselves: mutations and chance."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

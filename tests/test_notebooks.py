@@ -1,7 +1,5 @@
 """The notebooks run anywhere, show what is stored in them, and become pages."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

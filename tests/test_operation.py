@@ -1,7 +1,5 @@
 """Modules that are one operation of a compiled graph: results, derivatives, shapes, copies; all steps if asked for."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 

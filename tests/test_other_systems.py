@@ -1,7 +1,5 @@
 """What other operating systems and other packages of OpenCV do, where it is decided in kcal."""
 
-from __future__ import annotations
-
 import faulthandler
 import importlib
 import io

@@ -1,7 +1,5 @@
 """Every page that kcal serves or writes, in a real browser: axe finds nothing, also on a telephone."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The scripts that make docs/measured/paper.md run, at sizes at which their figures mean nothing."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from unittest.mock import Mock

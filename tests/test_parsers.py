@@ -1,7 +1,5 @@
 """kcal's parsers of OpenCV's and MATLAB's files read what the programs themselves write and read."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

@@ -1,7 +1,5 @@
 """No process with threads forks, none of ours leaves threads to one that does, and no test waits for ever."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -1,7 +1,5 @@
 """The README's Python gives the position that it says, and its figures and names are those of the rest."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

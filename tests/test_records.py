@@ -1,7 +1,5 @@
 """What long simulations share: files of finished captures, stretched images, intervals over captures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

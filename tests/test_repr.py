@@ -1,7 +1,5 @@
 """`repr` of what users hold: a few lines, with what matters, however much is inside."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import inspect

@@ -1,7 +1,5 @@
 """What SECURITY.md says: its limits are those of the code, and the container's user."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

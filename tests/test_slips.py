@@ -1,7 +1,5 @@
 """Slips of users get an `InputError` that names them: another type, another order, fields that do not fit."""
 
-from __future__ import annotations
-
 import pickle
 import warnings
 from collections.abc import Callable

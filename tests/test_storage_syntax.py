@@ -1,7 +1,5 @@
 """The syntax of OpenCV's and MATLAB's files: each rule, and what breaks it, with the line that is wrong."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """Texts of other people's files are shown and do nothing else."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

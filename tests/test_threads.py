@@ -1,7 +1,5 @@
 """One thread while small systems are solved, and the caller's settings of before afterwards."""
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

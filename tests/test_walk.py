@@ -1,7 +1,5 @@
 """As a user goes: a site is marked by clicks, and targets are watched while `kcal live` runs."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The job of the README in Python, from images to positions, with the names of `kcal` alone."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

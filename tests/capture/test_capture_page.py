@@ -1,7 +1,5 @@
 """The capture page in a real browser: it shows what was kept, and asks nothing beyond this machine."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Which frames are kept, what is on the disk, and how a session goes on and ends."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from pathlib import Path

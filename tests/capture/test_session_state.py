@@ -1,7 +1,5 @@
 """A session without its slow parts: what it proposes, what it shows, when it calibrates and when it ends."""
 
-from __future__ import annotations
-
 import math
 import threading
 from pathlib import Path

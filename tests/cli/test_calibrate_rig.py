@@ -1,7 +1,5 @@
 """`kcal calibrate` and `kcal rig` on simulated observations: what they write, and how they refuse."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """The command line itself: what it prints, settings, refusals, and its start."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """`kcal export`, `import`, `show` and `diff` through the command line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

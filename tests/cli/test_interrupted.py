@@ -1,7 +1,5 @@
 """Commands that are interrupted, and pages of captures."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Ctrl-C in commands of sites: stars, capture, marking, stations, rigs by the scene or by stars."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

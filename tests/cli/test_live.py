@@ -1,7 +1,5 @@
 """`kcal live`: tracks into files, stopped by SIGTERM and continued, and told what is wrong."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

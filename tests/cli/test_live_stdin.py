@@ -1,7 +1,5 @@
 """`kcal live --detections -` ends by a signal while its input stays open."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

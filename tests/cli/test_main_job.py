@@ -1,7 +1,5 @@
 """From images to a camera and its report: the main job, its messages, and settings of the lens."""
 
-from __future__ import annotations
-
 import functools
 import json
 import math

@@ -1,7 +1,5 @@
 """`kcal rig` of one camera that stood at two places, its file given twice, and `kcal locate` with that rig."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

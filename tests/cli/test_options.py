@@ -1,7 +1,5 @@
 """Commands from plain functions: options, their help, files and values, and options of several words."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

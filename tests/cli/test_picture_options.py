@@ -1,7 +1,5 @@
 """Pictures that commands write: PNG, SVG or PDF by their suffix, and nothing else."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

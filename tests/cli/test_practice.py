@@ -1,7 +1,5 @@
 """`kcal demo --practice` and `--score`: a folder that is filled, continued, never written over; a stranger's walk."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import shutil

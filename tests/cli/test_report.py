@@ -1,7 +1,5 @@
 """Reports and sites."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

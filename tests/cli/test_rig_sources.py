@@ -1,7 +1,5 @@
 """Rigs from other things than boards: stars, the scene, the skyline, moving cameras."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

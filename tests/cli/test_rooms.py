@@ -1,7 +1,5 @@
 """What commands take of the rooms: each name stands in the stub, which has no others, and is found where it says."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from pathlib import Path

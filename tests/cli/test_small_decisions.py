@@ -1,7 +1,5 @@
 """Small decisions of commands: which options go together, what stars are told of landmarks, how meters are written."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """`kcal rig` of many cameras, `kcal station` and `kcal locate` of what they saw."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

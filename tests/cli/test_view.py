@@ -1,7 +1,5 @@
 """`kcal view`: the same scene from marks, from positions and from tracks, and what does not belong together."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

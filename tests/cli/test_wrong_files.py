@@ -1,7 +1,5 @@
 """Files of the wrong kind and damaged ones, small commands for boards and lookups."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Images of bags of ROS 1 and ROS 2: the same pixels, corners and times as those of a folder."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 

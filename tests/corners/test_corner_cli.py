@@ -1,7 +1,5 @@
 """Corners on the command line: images from folders and servers, printed boards, and the limit of time."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import http.server

@@ -1,7 +1,5 @@
 """Detection: boards, parts of boards, the order of corners, and the filters that images go through."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

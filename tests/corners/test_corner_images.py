@@ -1,7 +1,5 @@
 """Images of boards: how they are read, resized and turned, and what is told of those without the board."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

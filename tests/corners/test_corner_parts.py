@@ -1,7 +1,5 @@
 """Parts of detection against hand calculations: grids, light, neighboring lines, correlation of patches, sizes."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

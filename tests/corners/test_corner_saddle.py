@@ -1,7 +1,5 @@
 """Refinement of corners: the saddle point, and the edges with their blur."""
 
-from __future__ import annotations
-
 import functools
 import math
 import os

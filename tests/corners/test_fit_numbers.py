@@ -1,7 +1,5 @@
 """What the fits of corners, ellipses and shifts compute, against dense matrices of NumPy and values by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

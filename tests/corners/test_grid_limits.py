@@ -1,7 +1,5 @@
 """Where the limits of grids, ends of boards, places and matches lie: just within, and just beyond."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """Boards with markers: AprilGrids, ChArUco boards, and boards whose markers cannot all be read."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

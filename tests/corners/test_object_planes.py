@@ -1,7 +1,5 @@
 """Planes of objects in both images, shifts on them with their gradients, keypoints, and points found again."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Raw images are developed so that no pixel moves. A DNG is written here, with a mosaic of colored pixels."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Which board images show: its kind, columns, rows and markers; images that do not agree; a board named wrongly."""
 
-from __future__ import annotations
-
 import functools
 import sys
 from pathlib import Path

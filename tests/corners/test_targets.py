@@ -1,7 +1,5 @@
 """What boards are, and files of corners: kcal's own and those of other programs."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Boards in tensors, and corners in pictures whose truth is known, as they were when last looked at."""
 
-from __future__ import annotations
-
 import functools
 import os
 from typing import Literal

@@ -3,8 +3,6 @@
 Seed and number of cases are fixed, so that a run is the same on every machine. `make fuzz` draws fresh seeds.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import io

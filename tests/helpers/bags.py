@@ -1,7 +1,5 @@
 """Bags of ROS 1 and ROS 2 with images, written by rosbags."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

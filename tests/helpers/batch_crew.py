@@ -1,7 +1,5 @@
 """Workers of a batch that are this process."""
 
-from __future__ import annotations
-
 from concurrent.futures import Future
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A small renderer of checkerboards with known corners, for the tests of the corners floor."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import torch

@@ -1,7 +1,5 @@
 """One Chromium for all tests of a process, and axe, which finds what a page keeps from some of its readers."""
 
-from __future__ import annotations
-
 import atexit
 import functools
 import importlib.util

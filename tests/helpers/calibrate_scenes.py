@@ -1,7 +1,5 @@
 """Simulated boards that the tests of this folder share: truth, poses and observations from a seed."""
 
-from __future__ import annotations
-
 import datetime
 import math
 from collections.abc import Sequence

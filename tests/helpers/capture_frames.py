@@ -1,7 +1,5 @@
 """Rendered frames of a board, as a camera sees them while it is photographed."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

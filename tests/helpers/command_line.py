@@ -1,7 +1,5 @@
 """The command line, as a user types it; `command` of `tests/conftest.py` is one."""
 
-from __future__ import annotations
-
 import csv
 import os
 import signal

@@ -1,7 +1,5 @@
 """Numeric derivatives for tests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """One small figure of each kind, and what can be asked of all of them."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Views of boards for a hybrid lens."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Cameras that the tests of images share."""
 
-from __future__ import annotations
-
 import torch
 
 from kcal.lens.camera import Camera

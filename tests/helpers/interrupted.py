@@ -10,8 +10,6 @@
 * `killed:N`: right after that, but killed, as when the power fails.
 """
 
-from __future__ import annotations
-
 import builtins
 import os
 import runpy

@@ -1,7 +1,5 @@
 """Lenses that the tests of this folder share."""
 
-from __future__ import annotations
-
 import math
 
 import torch

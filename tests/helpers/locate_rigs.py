@@ -1,7 +1,5 @@
 """Rigs with known geometry for the tests of kcal.locate."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Start `kcal mark` as a user does, and drive its page in Chromium."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """Every page that kcal serves or writes, with something on it."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager

@@ -1,7 +1,5 @@
 """Ports of this machine that no other test takes meanwhile."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

@@ -1,7 +1,5 @@
 """Simulated captures of printed boards that the tests share."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """A simulated site for the tests of joint rigs: three unlike cameras, boards, landmarks, far features."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """A camera on this machine: an RTSP server of one H.264 video, whose packets and sender reports libav makes."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import socket

@@ -1,7 +1,5 @@
 """Small pictures of upright textured planes by a rig with a baseline of 2 m, f 500 px."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from numpy.typing import NDArray

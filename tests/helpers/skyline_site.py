@@ -1,7 +1,5 @@
 """A small terrain, an image of its skyline and a raster of it, made once for all tests."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 from typing import NamedTuple

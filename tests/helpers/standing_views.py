@@ -1,7 +1,5 @@
 """Data of views that stand still, from a quadratic form alone."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

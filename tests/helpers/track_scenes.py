@@ -1,7 +1,5 @@
 """Targets that move before a rig of known errors, for tests and measurements of tracks."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Two small videos of moving textured targets, and a detector of bright spots."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Wait for what happens in another thread, process or browser; a deadline only ends a test that has failed."""
 
-from __future__ import annotations
-
 import contextlib
 import faulthandler
 import os

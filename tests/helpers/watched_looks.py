@@ -1,7 +1,5 @@
 """Looks at a rig that turns as a model says, without images."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Tests that compile a camera or a rig as one graph, which torch up to 2.9 cannot trace."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from packaging.version import Version

@@ -1,7 +1,5 @@
 """Files of kcal with one wrong field, and what loading says of them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path

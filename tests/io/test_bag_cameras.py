@@ -1,7 +1,5 @@
 """CameraInfo and tf in bags of ROS: written for rosbags, and read as drivers write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

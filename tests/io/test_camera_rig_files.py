@@ -1,7 +1,5 @@
 """Rig files of any number of cameras: everything comes back to the last bit, and what does not fit is refused."""
 
-from __future__ import annotations
-
 import datetime
 from pathlib import Path
 from typing import Any

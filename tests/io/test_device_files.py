@@ -5,8 +5,6 @@ mode_specific_calibration.c); librealsense (rsutil.h); Stereolabs' stereo calibr
 Open3D; nuscenes-devkit; DJI's Matrice 4 manual and Mavic 3M image processing guide.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

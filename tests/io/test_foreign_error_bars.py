@@ -1,7 +1,5 @@
 """Error bars of other programs: their files, mrcal's covariance, and grids of splines."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math

@@ -1,7 +1,5 @@
 """Lenses of other programs: read as their published formulas have them, all over the image, and written."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Camera files of other programs: values, pixel origins and poses, as their own documentation and readers have them."""
 
-from __future__ import annotations
-
 import json
 import struct
 import time

@@ -3,8 +3,6 @@
 Each reader runs in a process of its own (`scripts/fuzz/hunt.py`), so that a crash is a finding and not the end.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

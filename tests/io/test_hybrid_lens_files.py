@@ -1,7 +1,5 @@
 """Cameras with a hybrid lens in kcal's files: exact, by name, and refused when they do not fit."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Images and videos as they are stored: colors in their order, 8 and 16 bits, refusals."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """What a file tells besides parameters travels with the camera or rig, is written again, and never outlives them."""
 
-from __future__ import annotations
-
 import copy
 import json
 import pickle

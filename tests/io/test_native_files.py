@@ -1,7 +1,5 @@
 """kcal's camera and rig files: exact, and refused when they do not fit."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import json

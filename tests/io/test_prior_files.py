@@ -1,7 +1,5 @@
 """Files of priors, information and boards."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files of COLMAP with rigs, Basalt, multical and calib.io: values, poses, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import math
 import sqlite3

@@ -3,8 +3,6 @@
 What is right is computed by OpenCV or by the lens's own formula, and compared as pixels of points.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import gzip
 import json

@@ -1,7 +1,5 @@
 """What a file says of its camera and rig at a glance: the numbers are those of the camera and its covariance."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """What kcal writes in each foreign format, it reads as the same cameras and the same pair."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 

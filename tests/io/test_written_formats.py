@@ -1,7 +1,5 @@
 """Files that kcal writes for other programs: what is in them, for lenses that are not in the middle and for pairs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

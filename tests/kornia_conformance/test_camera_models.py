@@ -3,8 +3,6 @@
 Needs torch, kornia and pytest; `vectors.json` lies beside this file.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Rigs, localizers and `Undistort` with cameras of other makes: baked ones, and a class of a user."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`Camera` and `Rig` as modules: precision, devices' dtypes, state, batches, refusals."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 

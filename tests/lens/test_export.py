@@ -1,7 +1,5 @@
 """Cameras compile as one graph, export with any number of points, run as ONNX, map under vmap, and travel as files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import onnxruntime

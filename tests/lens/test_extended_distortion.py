@@ -1,7 +1,5 @@
 """Extended distortion and the bounds of its Taylor series."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import pickle

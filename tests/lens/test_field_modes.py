@@ -1,7 +1,5 @@
 """Fields of modes, Zernike modes, and poses."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

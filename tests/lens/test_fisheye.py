@@ -1,7 +1,5 @@
 """The fisheye: OpenCV's and kornia's values, what an angle is, derivatives, and a round trip to behind the camera."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """No pixel has two valid rays, also where a fold is too narrow to be seen by sampling."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Poses that a user frees: gradients reach them, and a rotation stays one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Cameras and rigs from what OpenCV's functions return: values, shapes, refusals, and what is doubted."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The default lens and its points."""
 
-from __future__ import annotations
-
 import copy
 import math
 

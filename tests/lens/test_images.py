@@ -1,7 +1,5 @@
 """Images: undistorted, turned, and a stack of cameras."""
 
-from __future__ import annotations
-
 import copy
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The inverse is right or says that it is not: round trips, folds, poles, and pixels that nothing maps to."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -4,8 +4,6 @@ This shows that derivatives fit the values; that the values are right is shown b
 `test_lens_conventions`.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

@@ -1,7 +1,5 @@
 """kcal's cameras, rigs and images together with the real kornia."""
 
-from __future__ import annotations
-
 import json
 
 import cv2

@@ -1,7 +1,5 @@
 """What the numbers mean: axes, pixel centers, skew, names and their order. One worked value for each."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

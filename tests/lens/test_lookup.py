@@ -1,7 +1,5 @@
 """Baked cameras: never farther off than they say, never valid where the camera is not, and readable by numpy alone."""
 
-from __future__ import annotations
-
 import functools
 import io
 import zipfile

@@ -1,7 +1,5 @@
 """Cameras whose field is a network of any class: gradients, copies, states, files."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

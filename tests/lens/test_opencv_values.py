@@ -1,7 +1,5 @@
 """Projection equals OpenCV's, over many points."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Projections in closed form: the pinhole, its gradients, the paraxial limit."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Cameras behind a flat port: derivatives, rays that start on the port's normal, files, and exact refraction."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Uncertainty of a camera: information, covariance over the image, and differences of two."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Cylinders, turned views, stereo rectification and rays, against OpenCV and against the cameras themselves."""
 
-from __future__ import annotations
-
 import math
 import warnings
 

@@ -1,7 +1,5 @@
 """The inverse over whole valid regions and images of many random lenses: a small run of `scripts/check/inverse.py`."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The closed form beside Eq. 9 by singular values, and against the optimum it claims."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Results as tables of other libraries, and positions as GeoParquet and GeoPackage, read back by their own readers."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

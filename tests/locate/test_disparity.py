@@ -1,7 +1,5 @@
 """Ranges from disparities, errors against a truth, and rows of a file that grows."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import math

@@ -1,7 +1,5 @@
 """Keys that must differ, in memory and beyond it: found if they are doubled, and only then."""
 
-from __future__ import annotations
-
 import errno
 import random
 import tempfile

@@ -1,7 +1,5 @@
 """A rig file becomes a localizer with the same errors as on the command line."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import partial
 from pathlib import Path

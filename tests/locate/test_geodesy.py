@@ -1,7 +1,5 @@
 """Geodesy and datums."""
 
-from __future__ import annotations
-
 import math
 import struct
 from pathlib import Path

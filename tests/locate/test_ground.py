@@ -1,7 +1,5 @@
 """One camera: places on level ground and terrain, hidden ones, and errors as large as stated."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

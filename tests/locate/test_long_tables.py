@@ -1,7 +1,5 @@
 """Tables of marks of any length: read, located and written in chunks, with the same result as in one piece."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

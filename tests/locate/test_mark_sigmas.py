@@ -1,7 +1,5 @@
 """Standard deviations of marks: those that are stated, those that are assumed, and none without a mark."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Tracks of known positions: reading, interpolation with its sigma, identities and clocks."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Located points against known ranges: true intervals pass as often as they should, and what is planted is named."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The split of range errors by what to improve: by hand, against the localizer, and for correlated errors."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

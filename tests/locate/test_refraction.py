@@ -1,7 +1,5 @@
 """Light that bends, from landmarks to heights: the coefficient of refraction as one of a rig's unknowns."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Errors of rig and mounting together: what `Localizer` adds up is what moving rig and mounting does."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Siting and error budgets of rigs."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Surveys and their files."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

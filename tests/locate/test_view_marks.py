@@ -1,7 +1,5 @@
 """Long tables of marks: any order, any subset of cameras, times, in parts as in one, and features of many cameras."""
 
-from __future__ import annotations
-
 import csv
 import math
 import random

@@ -1,7 +1,5 @@
 """Rows of a filter: against the rig's projection, and against what fits points to their optimum."""
 
-from __future__ import annotations
-
 import torch
 
 from kcal import Camera, Localizer, Origin, Rig

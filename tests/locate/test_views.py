@@ -1,7 +1,5 @@
 """Marks of any number of cameras: long tables as they are read, and the positions and texts that come of them."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A real browser: a site is marked by script as an operator would, and the server is killed in between."""
 
-from __future__ import annotations
-
 import math
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Shapes and pictures of the marking page."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Shapes before a texture: what it is, and errors that are as small and as large as stated."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The marking page in a real browser: windows on the same marks, clicks beside the picture, what is said and when."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """The inverse network and its chart."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable

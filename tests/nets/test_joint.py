@@ -1,7 +1,5 @@
 """Joint training, and the residual networks."""
 
-from __future__ import annotations
-
 import functools
 from unittest.mock import Mock
 

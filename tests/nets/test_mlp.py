@@ -1,7 +1,5 @@
 """Small networks: closed-form derivatives equal autograd's and numeric ones."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

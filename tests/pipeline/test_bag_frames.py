@@ -1,7 +1,5 @@
 """Frames of bags in what follows videos: times, pixels, partners; `kcal watch` and `kcal mark` on bags."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

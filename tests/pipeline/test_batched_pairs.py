@@ -1,7 +1,5 @@
 """Boxes in batches, with gradients, and on another device: `PairBoxes`, `Detections` and what takes them."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from elsewhere import DEVICE, Elsewhere

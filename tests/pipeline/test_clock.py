@@ -1,7 +1,5 @@
 """Clocks, and which frames of videos belong together."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

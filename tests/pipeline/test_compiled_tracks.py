@@ -1,7 +1,5 @@
 """Compiled tracks are those of the steps as they are: from one target to many, through births, occlusion and turns."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
 import pytest

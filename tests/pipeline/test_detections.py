@@ -1,7 +1,5 @@
 """Detections and lines of JSON: what a detector returns, what it may be, and how a line is read."""
 
-from __future__ import annotations
-
 import sys
 import types
 from typing import Any

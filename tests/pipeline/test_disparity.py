@@ -1,7 +1,5 @@
 """Disparity of objects in both images, and where objects are refused."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

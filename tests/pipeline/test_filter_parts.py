@@ -1,7 +1,5 @@
 """Parts of the tracker against closed forms and brute force."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Live streams on this machine: RTSP with the times of RTCP reports, MPEG-TS with those of arrival, interruptions."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import socket

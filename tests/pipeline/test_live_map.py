@@ -1,7 +1,5 @@
 """The live map: told to this machine's pages only, newest first, and drawn by a real browser if there is one."""
 
-from __future__ import annotations
-
 import multiprocessing
 import threading
 import urllib.error

@@ -1,7 +1,5 @@
 """MQTT: messages arrive at a broker; one that is not there is named, without its password."""
 
-from __future__ import annotations
-
 import datetime
 import socket
 import threading

@@ -1,7 +1,5 @@
 """The live map behind a real web server with TLS, configured as `docs/howto/proxy.md` says."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import os

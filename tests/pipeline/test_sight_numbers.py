@@ -1,7 +1,5 @@
 """Lines of sight of several cameras: pencils, points, groups, and matches as exhaustive search finds them."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

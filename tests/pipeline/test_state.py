@@ -1,7 +1,5 @@
 """Modules of several inputs travel as ONNX."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import onnxruntime

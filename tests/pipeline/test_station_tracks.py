@@ -1,7 +1,5 @@
 """Tracks over stations far apart: who saw what, names that stay at a hand-over, bearings of one, clocks of each."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Streams: the same bytes whether killed or not, and times that are wrong."""
 
-from __future__ import annotations
-
 import csv
 import datetime
 import io

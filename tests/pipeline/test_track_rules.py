@@ -1,7 +1,5 @@
 """When tracks are told, lost, forgotten and recognized; how far bands of epipolar lines and patches of looks reach."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tracks: the localizer's own numbers at birth, consistent afterwards, never below the systematic part, names kept."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import math

@@ -1,7 +1,5 @@
 """The same sightings through Stone Soup's filter and smoother, with models written independently: the same numbers."""
 
-from __future__ import annotations
-
 import datetime
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames of videos: their times, which belong together, damaged and wrong files, and threads that hand them over."""
 
-from __future__ import annotations
-
 import shutil
 import threading
 from collections import namedtuple

@@ -7,8 +7,6 @@ again: `tests/promises/test_files.py` reads the files with the present code and 
 version has.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The table of cases that can be read without Python, `accept.txt`: each holds in both directions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The check of pins against a stored list of advisories."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

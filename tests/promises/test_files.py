@@ -1,7 +1,5 @@
 """Files of every version load to the numbers that the version itself computed from them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The published schemas hold for what kcal writes, and refuse what it would refuse."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What users rely on stays: names, signatures, attributes, commands; `scripts/make_promises.py` lists them."""
 
-from __future__ import annotations
-
 import pytest
 
 from scripts.make_promises import command_lines, python_lines, stored

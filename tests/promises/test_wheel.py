@@ -1,7 +1,5 @@
 """The wheel: byte-identical from two builds, with its bill of materials, licenses and types inside."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -3,8 +3,6 @@
 After a change that is meant, look at the pictures, then write the numbers anew: KCAL_WRITE_DRAWN=1 and this file.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

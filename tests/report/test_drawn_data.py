@@ -1,7 +1,5 @@
 """What pictures show is where it is: numbers of their lines and marks against the things that were drawn."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

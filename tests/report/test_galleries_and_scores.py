@@ -1,7 +1,5 @@
 """Galleries, coverage and sketches show what they were given; scores of positions and tracks against a truth."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """The map as a file, and in a real browser where there is one."""
 
-from __future__ import annotations
-
 import html
 import json
 import math

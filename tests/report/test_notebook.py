@@ -1,7 +1,5 @@
 """What notebooks show: the command line's picture or table, complete and escaped, without jinja2."""
 
-from __future__ import annotations
-
 import base64
 import copy
 import io

@@ -1,7 +1,5 @@
 """Pictures are drawn into panels and figures of the caller, with the same content as alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

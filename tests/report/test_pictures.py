@@ -1,7 +1,5 @@
 """Pictures of reports: boards, every picture, and marks that are small."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 from typing import Any

@@ -1,7 +1,5 @@
 """Numbers and sentences of reports: scores against a truth, tables of a verdict, what a difference means."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

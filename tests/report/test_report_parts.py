@@ -1,7 +1,5 @@
 """Limits of findings, ranges of rigs by hand, popups of the map, tables of a page."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import io

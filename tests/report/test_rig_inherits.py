@@ -1,7 +1,5 @@
 """A rig is no better than its cameras, their boards and its own solution, and says what could not be checked."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables of located points: numbers with their signs, and empty cells where nothing is known."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The verdict: each planted fault is found and named, a clean capture is not doubted, and the page says so."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

@@ -1,7 +1,5 @@
 """Summaries and the reason of a verdict."""
 
-from __future__ import annotations
-
 import base64
 import math
 import re

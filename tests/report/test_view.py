@@ -1,7 +1,5 @@
 """Recordings for the viewer rerun, read back with its own reader."""
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Each step of what errors of matches have in common, against values worked out by hand or in plain loops."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

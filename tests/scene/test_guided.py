@@ -1,7 +1,5 @@
 """Keypoints along epipolar lines against a search by hand, and matches refined from where they roughly are."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Limits of matches along epipolar lines on both sides: parallax, band, what is no match; which image is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """What is kept of matches, shifts by whole pixels and patches, against values worked out by hand."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Matches of ground at a slant: optics blur it differently in both images, and it shines differently."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The practice site: pictures whose geometry is exact, and a film in which ships are where the truth says."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rendered boards and scenes, backdrops, and captures by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Pictures of a terrain: what both cameras see is the same thing where the truth says so, in any light."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

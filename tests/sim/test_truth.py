@@ -1,7 +1,5 @@
 """The true lens: tracing, its table and inverse, and the error at infinity."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

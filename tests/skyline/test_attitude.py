@@ -1,7 +1,5 @@
 """Attitude from a skyline: found without a rough pose, with its σ, and refused where it is not determined."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

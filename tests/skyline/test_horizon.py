@@ -1,7 +1,5 @@
 """The horizon and the border of the sky."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Skylines in the adjustment of a rig: shared errors count once, cameras side by side share them."""
 
-from __future__ import annotations
-
 import functools
 import math
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """Derivatives of the solution: implicit gradients and the Hessian."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The Levenberg-Marquardt loop: known minima through every solver, and honest behavior where there is none."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

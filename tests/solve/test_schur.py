@@ -1,7 +1,5 @@
 """Normal equations: elimination, batches, dense problems and weights."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The catalog of stars, and chance matches."""
 
-from __future__ import annotations
-
 import datetime
 
 import numpy as np

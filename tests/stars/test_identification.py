@@ -1,7 +1,5 @@
 """Stars found in rendered images, named without pointing, and what is refused."""
 
-from __future__ import annotations
-
 import builtins
 import datetime
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Parts of reading a night: the sky's level, what is a star, names beside other stars, times, moments and plans."""
 
-from __future__ import annotations
-
 import datetime
 import itertools
 import math

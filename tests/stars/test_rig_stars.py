@@ -1,7 +1,5 @@
 """Rigs solved from stars: recovery, coverage, clocks, and what stars leave open."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import math

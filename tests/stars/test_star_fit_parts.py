@@ -1,7 +1,5 @@
 """Parts of fits to stars against hand calculations: turns, refraction, clocks, joint posteriors, rough lenses."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import math

@@ -1,7 +1,5 @@
 """Stars and names just within and just beyond each limit, and their numbers by hand."""
 
-from __future__ import annotations
-
 import datetime
 import math
 from pathlib import Path

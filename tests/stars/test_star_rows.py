@@ -1,7 +1,5 @@
 """What named and nameless stars of several cameras become for a rig: row by row, clocks and nights by hand."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import math

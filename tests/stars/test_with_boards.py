@@ -1,7 +1,5 @@
 """Stars together with boards, and in two images."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

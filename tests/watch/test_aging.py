@@ -1,7 +1,5 @@
 """What a rig forgets by day."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """A rig that is checked and corrected: what was known of it is turned into the right axes, and nothing is lost."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

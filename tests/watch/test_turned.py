@@ -1,7 +1,5 @@
 """The monitor of a rig's attitude: turns found to their sigmas, moving things named, statistics as stated."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

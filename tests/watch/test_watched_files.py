@@ -1,7 +1,5 @@
 """Files and state of a watched rig."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal

@@ -1,7 +1,5 @@
 """The coastline in the package, against capes and inland places that everyone knows."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from importlib import resources

@@ -1,7 +1,5 @@
 """The socket of a local server: this machine's own address alone, and another port only where it may be."""
 
-from __future__ import annotations
-
 import http.client
 import socket
 import threading

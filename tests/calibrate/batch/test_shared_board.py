@@ -1,7 +1,5 @@
 """Batches whose cameras share a board: what is passed on, kept and said; with calibrations that take no time."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """What the next pictures should show: each sentence of advice where it belongs, and nowhere else."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Cameras between settings of zoom and focus: exact at settings, honest between them, refused beyond them."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -1,7 +1,5 @@
 """One camera, simulated: truth comes back, error bars mean what they say, and bad data are refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 

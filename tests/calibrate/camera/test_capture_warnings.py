@@ -1,7 +1,5 @@
 """What is said of views that moved while their rows were read, and of boards that are not as ordered."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

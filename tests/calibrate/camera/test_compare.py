@@ -1,7 +1,5 @@
 """Comparison of models, refits, files of results, and the check of intervals."""
 
-from __future__ import annotations
-
 import functools
 import math
 from pathlib import Path

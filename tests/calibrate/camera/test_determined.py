@@ -1,7 +1,5 @@
 """What the views determine, and what to trust of it."""
 
-from __future__ import annotations
-
 import math
 import re
 

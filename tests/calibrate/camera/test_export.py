@@ -1,7 +1,5 @@
 """Cameras for other programs: exact where the format holds the lens, else fitted with a true maximum."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Export of several cameras into one file: one lens model for all, wide where others are far off, or a note."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

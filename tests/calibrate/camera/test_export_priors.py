@@ -1,7 +1,5 @@
 """Priors for other programs: the square-root information means what it says, in the other program itself."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

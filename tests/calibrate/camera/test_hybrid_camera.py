@@ -1,7 +1,5 @@
 """The default of `calibrate_camera`: no model to choose, honest error bars, outliers, and clear refusals."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Where parametric cameras begin, and that this decides nothing: narrow and wide lenses, without any guess."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`interval_check`: true error bars are found true, false ones false; and the command with its files and exit codes."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """Gradients through a calibration: against solving anew, against recorded steps, and where there are none."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

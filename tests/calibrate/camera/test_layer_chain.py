@@ -1,7 +1,5 @@
 """Calibration, rig and position as one chain of gradients; and the layer on another device."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, pixels_of

@@ -1,7 +1,5 @@
 """The view to take next: what it promises is what its rows give, and no other view promises more."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

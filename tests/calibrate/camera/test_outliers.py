@@ -1,7 +1,5 @@
 """What is left out, views that repeat each other, and weak priors."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from unittest.mock import Mock

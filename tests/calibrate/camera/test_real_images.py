@@ -1,7 +1,5 @@
 """The 26 real images of OpenCV's stereo sample (environment variable KCAL_DATA), against OpenCV on the same corners."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

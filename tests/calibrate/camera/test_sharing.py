@@ -1,7 +1,5 @@
 """Cameras calibrated together share the board that they saw, and only that."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How a calibration is held against itself: which halves are compared, and what structure of residuals measures."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from calibrate_scenes import observe

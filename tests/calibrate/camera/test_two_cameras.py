@@ -1,7 +1,5 @@
 """Views of another camera, zoom or crop are named; a lens that moves by view widens error bars; good ones stay."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Collection

@@ -1,7 +1,5 @@
 """Corners of a board that are off their places one by one: found where they are, and only there; carried on."""
 
-from __future__ import annotations
-
 import functools
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Boards: their prior, bending, and fleets of cameras that saw one."""
 
-from __future__ import annotations
-
 import functools
 import math
 import os

@@ -1,7 +1,5 @@
 """Several cameras and one board: shared where it is one, turned where it was read from another end."""
 
-from __future__ import annotations
-
 import functools
 import math
 

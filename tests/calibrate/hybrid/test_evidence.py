@@ -1,7 +1,5 @@
 """Evidence, amplitudes and unknowns of the default lens."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

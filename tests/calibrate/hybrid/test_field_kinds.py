@@ -1,7 +1,5 @@
 """Fits of a simulated camera with fields of every kind; the evidence sets their amplitudes."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

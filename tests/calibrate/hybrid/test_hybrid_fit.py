@@ -1,7 +1,5 @@
 """The hybrid camera by evidence: simulated truth with a wandering pupil and a printed board comes back."""
 
-from __future__ import annotations
-
 import functools
 import math
 

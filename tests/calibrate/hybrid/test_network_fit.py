@@ -1,7 +1,5 @@
 """The network of a field, trained together with camera, poses and board."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """What rounds of evidence decide, what several cameras say of a board, and what one tells of its type."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

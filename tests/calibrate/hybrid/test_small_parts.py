@@ -1,7 +1,5 @@
 """Small parts of the fit, and boards that were measured."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The board problem: its rows are the derivatives of its residuals, and its residuals are those of the cameras."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

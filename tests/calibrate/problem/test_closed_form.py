@@ -1,7 +1,5 @@
 """Closed-form starts, parameters and their prior widths."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

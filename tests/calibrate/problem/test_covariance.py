@@ -1,7 +1,5 @@
 """The covariance of all parameters: a block of the inverse, and unknown where it cannot be computed."""
 
-from __future__ import annotations
-
 import math
 from unittest.mock import Mock
 

@@ -1,7 +1,5 @@
 """Views that move while their rows are read, and pixels that are not square: found where they are, and only there."""
 
-from __future__ import annotations
-
 import functools
 import math
 

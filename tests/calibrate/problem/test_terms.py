@@ -1,7 +1,5 @@
 """Terms of the board problem, weights, and robust losses."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from calibrate_scenes import camera, corner_pixels, motions, observe, pixels_of

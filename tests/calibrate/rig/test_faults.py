@@ -1,7 +1,5 @@
 """Faults that no residual shows: nothing left over, several solutions or explanations, a source that contradicts."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

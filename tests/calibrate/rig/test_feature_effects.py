@@ -1,7 +1,5 @@
 """Features whose marks share an error: derivatives, what the adjustment finds of it, and what it does to the pose."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

@@ -1,7 +1,5 @@
 """Landmarks that something shifts together: derivatives, and what the adjustment finds of it."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

@@ -1,7 +1,5 @@
 """Cameras mixed up: the same one twice, left and right swapped throughout, and mirror images of a rig."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """Boards held by hand before rolling shutters: rigs find the motion and take it out; on stands there is none."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import math

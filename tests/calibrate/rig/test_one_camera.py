@@ -1,7 +1,5 @@
 """One camera that was moved from place to place: its lens is the same unknown at all of them."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -1,7 +1,5 @@
 """A source that is worse than its sigmas say is told so and counts less, whatever stands beside it."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """What calibrations know of lenses and board enters a rig once, whole, and leaves it refined."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import functools

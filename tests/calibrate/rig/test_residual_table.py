@@ -1,7 +1,5 @@
 """Residuals of calibrations as tables of Arrow."""
 
-from __future__ import annotations
-
 import pandas
 import polars
 from drawn_scenes import calibrated, landmarks_rig

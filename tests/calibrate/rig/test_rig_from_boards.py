@@ -1,7 +1,5 @@
 """Rigs, simulated: the pose comes back, turned and wrong pairs are found, and mixed-up input is refused."""
 
-from __future__ import annotations
-
 import functools
 import os
 import re

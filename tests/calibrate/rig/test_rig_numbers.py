@@ -1,7 +1,5 @@
 """What is counted, summed and compared of a rig's solution, against SciPy, dense matrices and values by hand."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

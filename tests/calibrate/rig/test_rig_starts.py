@@ -1,7 +1,5 @@
 """How a rig begins and whether its cameras were synchronous: poses of few points, boards of pairs, places by hand."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Joint rigs, simulated: derivatives, recovery, covariances, wrong items named, what is not determined named."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """Landmarks in a row, a plane or one place: rigs are refused or intervals widened; ordinary rigs are left alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
