@@ -83,8 +83,7 @@ F64 = torch.float64
 
 
 def test_points_are_float64_of_the_right_shape() -> None:
-    found = as_points("x", torch.ones(3, 2, dtype=torch.float32), 2)
-    assert found.dtype == F64
+    assert as_points("x", torch.ones(3, 2, dtype=torch.float32), 2).dtype == F64
     assert as_points("x", torch.ones(2, dtype=F64), 2).shape == (2,)
     for value, message in (
         (torch.ones(3, 2, dtype=torch.int64), r"floating point is needed, got torch.int64"),
@@ -189,8 +188,7 @@ def test_the_first_value_that_is_not_finite_is_named() -> None:
 def test_covariances() -> None:
     assert torch.equal(as_covariance("x", None, 2), torch.zeros(2, 2, dtype=F64))
     # Of units that differ by a million, with rounding that is not symmetric; and of rank one, and zero.
-    large = torch.tensor([[1e12, 3e5], [3e5 * (1 + 1e-10), 1.0]], dtype=F64)
-    found = as_covariance("x", large, 2)
+    found = as_covariance("x", torch.tensor([[1e12, 3e5], [3e5 * (1 + 1e-10), 1.0]], dtype=F64), 2)
     assert torch.equal(found, found.T)
     assert float(found[0, 1]) == pytest.approx(3e5 * (1 + 5e-11), rel=1e-13)
     for good in (torch.ones(2, 2), torch.zeros(2, 2), torch.tensor([[0.0, 0.0], [0.0, 4.0]])):

@@ -15,9 +15,8 @@ from locate_rigs import pinhole_rig
 from torch import Tensor, nn
 
 import kcal
+from kcal import Localizer, Origin
 from kcal.lens.pair_errors import RigCovariance
-from kcal.lens.rig import Origin
-from kcal.locate.localizer import Localizer
 
 
 def named_tuples(kind: object) -> set[type[tuple]]:

@@ -93,8 +93,7 @@ class TestWriteAtomic:
         assert write_atomic(tmp_path / "a.txt", "x").read_text() == "x"
 
     def test_long_names(self, tmp_path: Path) -> None:
-        longest = tmp_path / ("a" * 251 + ".txt")
-        assert write_atomic(longest, "x").read_text() == "x"
+        assert write_atomic(tmp_path / ("a" * 251 + ".txt"), "x").read_text() == "x"
         for write in (check_writable, lambda path: write_atomic(path, "x")):
             with pytest.raises(FileError, match="cannot write: File name too long"):
                 write(tmp_path / ("a" * 300))

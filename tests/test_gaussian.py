@@ -47,8 +47,7 @@ def test_order_and_grouping_are_irrelevant(seed: int, order: list[object]) -> No
         assert set(other.slots) == set(SLOTS)
         same(whole, other)
     same(whole, whole.compressed())
-    moved = whole.placed(tuple(order), normal(5, seed=seed + 6))
-    same(whole, moved)
+    same(whole, whole.placed(tuple(order), normal(5, seed=seed + 6)))
 
 
 @given(seeds, st.sets(st.sampled_from(SLOTS), min_size=1, max_size=4))
@@ -72,8 +71,7 @@ def test_marginal_and_conditional_are_those_of_the_dense_covariance(seed: int, k
         same(held.placed(slots, held.at[[held.slots.index(slot) for slot in slots]]), held, slots)
         torch.testing.assert_close(dense(held, slots)[0], information[own][:, own], rtol=1e-12, atol=1e-12)
         # The best of the others while these stay where they are.
-        columns = known.rows[:, own]
-        best = known.at[own] - torch.linalg.lstsq(columns, known.rows[:, -1:]).solution[:, 0]
+        best = known.at[own] - torch.linalg.lstsq(known.rows[:, own], known.rows[:, -1:]).solution[:, 0]
         torch.testing.assert_close(held.placed(slots, known.at[own]).mean, best, rtol=1e-9, atol=1e-9)
 
 
@@ -153,8 +151,7 @@ def test_refused() -> None:
 
 def test_nearly_undetermined_directions_survive() -> None:
     """Columns of units 1e-4 apart and a valley 1e-10 wide: normal equations would lose it."""
-    rows = torch.tensor([[1.0, 1.0], [0.0, 1e-10]]).double()
-    half = posterior_half(rows)
+    half = posterior_half(torch.tensor([[1.0, 1.0], [0.0, 1e-10]]).double())
     # x = (1, -1) / 1e-10 moves the rows by one.
     sigma = torch.linalg.vector_norm(half, dim=0)
     torch.testing.assert_close(sigma, torch.full((2,), 1e10).double(), rtol=1e-5, atol=0)

@@ -18,8 +18,7 @@ PLACES = torch.tensor([[0, 0, 0.9], [0.2, 0.1, 1.0], [-0.2, 0.1, 0.8], [0.1, -0.
 
 def places(points: torch.Tensor) -> torch.Tensor:
     """Corners (V, N, 3) in the camera's frame."""
-    middle = POINTS.mean(0)
-    return (points - middle) @ rotation_from_vector(TILTS).transpose(-1, -2) + PLACES[:, None]
+    return (points - POINTS.mean(0)) @ rotation_from_vector(TILTS).transpose(-1, -2) + PLACES[:, None]
 
 
 def views(points: torch.Tensor = POINTS) -> torch.Tensor:

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from kcal import FileError, KcalError, files, threads
 from kcal import __main__ as program
-from kcal import files, threads
-from kcal.errors import FileError, KcalError
 
 
 class WindowsLocks(types.ModuleType):

@@ -105,6 +105,5 @@ def test_the_tutorial_is_found_and_read(site: Path, width: int) -> None:
             page.locator(".md-search__input").fill("")
             page.locator(".md-search__input").click()
             page.keyboard.type(word)
-            first = page.locator(".md-search-result__item").first
-            first.locator(f"text={title}").first.wait_for()
+            page.locator(".md-search-result__item").first.locator(f"text={title}").first.wait_for()
         assert page.complaints == []

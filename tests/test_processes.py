@@ -156,8 +156,7 @@ def test_an_open_video_has_no_threads(video: Path) -> None:
     from kcal.pipeline.video_source import file_frames
 
     before = len(os.listdir("/proc/self/task"))
-    frames = file_frames(video, (320, 240))
-    frame = next(frames)
+    frame = next(file_frames(video, (320, 240)))
     colors, gray = frame.colors(), frame.gray()
     assert colors.shape[:2] == gray.shape == (240, 320)
     assert len(os.listdir("/proc/self/task")) == before

@@ -252,8 +252,7 @@ def test_damaged_mat(body: bytes, message: str) -> None:
 
 
 def test_limits_of_mat(monkeypatch: pytest.MonkeyPatch) -> None:
-    inner = element(9, bytes(8))
-    body = array(6, (1, 1), inner)
+    body = array(6, (1, 1), element(9, bytes(8)))
     for _ in range(15):
         body = array(1, (1, 1), body)
     read_mat(head() + body, "x")

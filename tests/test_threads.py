@@ -17,9 +17,8 @@ import torch
 from threadpoolctl import ThreadpoolController
 from waiting import PATIENCE
 
+from kcal import Observations, calibrate_camera
 from kcal.__main__ import _THREADS, main
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.corners.observations import Observations
 from kcal.threads import in_one_thread, one_thread
 
 # Other tests load libraries that nothing computes with, each with an OpenMP of its own.

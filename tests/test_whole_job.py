@@ -100,8 +100,7 @@ def test_from_images_to_positions(images: Path, tmp_path: Path) -> None:
     for name in ("positions.csv", "positions.geojson", "positions.kml", "positions.cot"):
         kcal.locate.write_positions(tmp_path / name, located)
     kcal.report.save_map(tmp_path / "map.html", located, truth)
-    rows = rows_of(tmp_path / "positions.csv")
-    assert [row["name"] for row in rows] == ["gate", "mast"]
+    assert [row["name"] for row in rows_of(tmp_path / "positions.csv")] == ["gate", "mast"]
     features = json.loads((tmp_path / "positions.geojson").read_text())["features"]
     place = kcal.locate.enu_to_geodetic(truth[:1], ORIGIN)[0].tolist()
     gate = next(item for item in features if item["properties"].get("name") == "gate")

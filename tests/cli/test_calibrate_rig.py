@@ -14,15 +14,11 @@ from command_line import Command
 from torch import Tensor
 from typer.testing import CliRunner
 
+from kcal import Board, Camera, DegenerateError, Observations, Rig, View
 from kcal.cli.main import app
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
-from kcal.errors import DegenerateError
 from kcal.io.camera_file import CameraFile, camera_to_file
 from kcal.io.rig_file import RigFile
-from kcal.lens.camera import Camera
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
 from kcal.texts import number_text
 
 BOARD = Board(columns=7, rows=6, square=0.05)
@@ -152,8 +148,7 @@ class TestCalibrate:
         ],
     )
     def test_names_that_do_not_fit(self, folder: Path, command: Command, arguments: str, message: str) -> None:
-        text = command.refuses("calibrate left.obs.json -o a.json --model opencv5", arguments)
-        assert message in text
+        assert message in command.refuses("calibrate left.obs.json -o a.json --model opencv5", arguments)
 
     def test_board_warp_and_a_warning(self, folder: Path, command: Command) -> None:
         content = json.loads((folder / "left.obs.json").read_text())
@@ -203,13 +198,11 @@ class TestCalibrate:
     @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="the superuser may write anywhere")
     def test_no_permission_is_told_before_any_work(self, folder: Path, command: Command) -> None:
         (folder / "shut").mkdir(mode=0o500)
-        text = command.refuses("calibrate left.obs.json -o shut/a.json")
-        assert "no permission to write here" in text
+        assert "no permission to write here" in command.refuses("calibrate left.obs.json -o shut/a.json")
 
     def test_output_is_checked_before_any_work(self, folder: Path, command: Command) -> None:
         """No minute is spent on what cannot be written; a rig's output is checked even before its inputs are read."""
-        text = command.refuses("rig none.json none.json", PAIRS, "-o no/a.json")
-        assert "make it first" in text
+        assert "make it first" in command.refuses("rig none.json none.json", PAIRS, "-o no/a.json")
 
 
 class TestRig:
@@ -284,8 +277,7 @@ class TestRig:
     def test_swapped_throughout(self, folder: Path, command: Command) -> None:
         """Cameras and observations agree; the right camera is on the left: their names may be wrong."""
         pairs = "--pairs right.obs.json left.obs.json"
-        both = ["right.camera.json", "left.camera.json"]
-        said = command("rig", *both, pairs, "-o rig.json").err
+        said = command("rig", *["right.camera.json", "left.camera.json"], pairs, "-o rig.json").err
         assert "to the left of the left camera: left and right are swapped" in said
 
     @pytest.mark.slow

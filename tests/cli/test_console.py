@@ -25,13 +25,11 @@ from rich.console import Console
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
-from kcal import Board, Camera, Observations, View, load_rig, save_camera
+from kcal import Board, Camera, FileError, Observations, View, load_rig, save_camera, save_rig
 from kcal.cli.console import err, out, print_styled, print_table, print_wrote, steps, warn
 from kcal.cli.main import app, main, usage_errors_shown
 from kcal.cli.options import SETTINGS, defaults_of, read_settings, toml_text
-from kcal.errors import FileError
 from kcal.files import read_bytes, replaced, write_atomic, written_files
-from kcal.io.rig_file import save_rig
 from kcal.texts import visible
 from scripts.bench.startup import helps, measure, on_terminal
 
@@ -128,8 +126,7 @@ def test_long_names_are_errors_of_one_line(
 def test_a_pipe_is_an_error_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe.png")
-    said = command.refuses("detect pipe.png --board 9x6 --square 25mm -o x.json")
-    assert "not a regular file" in said
+    assert "not a regular file" in command.refuses("detect pipe.png --board 9x6 --square 25mm -o x.json")
 
 
 @pytest.mark.parametrize(
@@ -353,8 +350,7 @@ PIXELS = tuple((100.0 + 50.0 * column, 100.0 + 50.0 * row) for row in range(3) f
 @pytest.fixture(scope="module")
 def start_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     start_folder = tmp_path_factory.mktemp("startup")
-    rig = load_rig(SAMPLE)
-    save_camera(rig.left, start_folder / "left.json")
+    save_camera(load_rig(SAMPLE).left, start_folder / "left.json")
     plain = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), coefficients=[-0.1, 0.01, 0, 0])
     save_camera(plain, start_folder / "plain.json", name="plain")
     views = (View(name="a.png", pixels=PIXELS),)

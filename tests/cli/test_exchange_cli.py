@@ -26,8 +26,7 @@ def test_a_rig_of_three_cameras_goes_there_and_back(tmp_path: Path, camera: Path
     one.calibration = None
     aside = torch.tensor([[0.0, 0, 0], [-1, 0, 0], [-2, 0, 0.1]], dtype=torch.float64)
     rig = Rig([one] * 3, ["a", "b", "c"], torch.eye(3, dtype=torch.float64).expand(3, 3, 3), aside)
-    path = save_rig(rig, tmp_path / "three.json")
-    run("export", path, "--format", "toml", "-o", tmp_path / "three.toml")
+    run("export", save_rig(rig, tmp_path / "three.json"), "--format", "toml", "-o", tmp_path / "three.toml")
     assert "rig from toml: a, b, c" in run("import", tmp_path / "three.toml", "-o", tmp_path / "back.json")
     back = load_rig(tmp_path / "back.json")
     assert float((back.translation - back.translation[0] - aside).abs().max()) < 1e-12
@@ -65,8 +64,7 @@ def test_a_fitted_lens_is_told_with_a_picture(tmp_path: Path, camera: Path) -> N
 
 def test_rigs(tmp_path: Path, camera: Path) -> None:
     one = load_camera(camera)
-    rig = Rig.pair(one, one, torch.eye(3), torch.tensor([-1.5, 0.0, 0.0]))
-    save_rig(rig, tmp_path / "rig.json")
+    save_rig(Rig.pair(one, one, torch.eye(3), torch.tensor([-1.5, 0.0, 0.0])), tmp_path / "rig.json")
     text = run("export", tmp_path / "rig.json", "--format", "ros", "-o", tmp_path / "ros.yaml")
     assert "ros_left.yaml" in text
     text = run("import", tmp_path / "ros_left.yaml", tmp_path / "ros_right.yaml", "-o", tmp_path / "back.json")

@@ -15,8 +15,7 @@ from calibrate_scenes import BOARD, corner_pixels, observe
 from interrupted import interrupt
 from typer.testing import CliRunner, Result
 
-from kcal import Observations, load_camera, load_rig, save_camera
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal import CalibrationOptions, Observations, calibrate_camera, load_camera, load_rig, save_camera
 from kcal.cli.main import app
 
 # Ctrl-C: a command ends with one line and exit code 130, whatever it is doing, and leaves nothing torn behind.
@@ -182,8 +181,7 @@ def test_the_address_is_on_one_line_and_opened(tmp_path: Path, opened: list[str]
 
 
 def test_no_page(tmp_path: Path, opened: list[str]) -> None:
-    done = capture(tmp_path, "--no-page")
-    assert "capture page" not in done.output
+    assert "capture page" not in capture(tmp_path, "--no-page").output
     assert opened == []
     assert Server.made == []
 
@@ -237,11 +235,9 @@ def test_a_stereo_capture_from_observations_to_the_verdict_on_its_rig(kcal_data:
         assert code == 0, text
         seen.append(file)
         cameras.append(camera)
-        lens = load_camera(camera)
-        assert lens.calibration.record.rms < 0.5
+        assert load_camera(camera).calibration.record.rms < 0.5
     code, text = kcal("report", cameras[0], "--observations", seen[0], "-o", tmp_path / "left.html", "--json")
-    told = json.loads(text[text.index("{") :])
-    assert code == (0 if told["verdict"]["usable"] else 3)
+    assert code == (0 if json.loads(text[text.index("{") :])["verdict"]["usable"] else 3)
     assert (tmp_path / "left.html").stat().st_size > 100_000
     code, text = kcal("rig", *cameras, "--pairs", *seen, "-o", tmp_path / "rig.json")
     assert code == 0, text

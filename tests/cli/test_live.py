@@ -14,9 +14,8 @@ from command_line import at_moment, rows_of
 from track_scenes import ORIGIN, seen_by, tracked_site
 from typer.testing import CliRunner
 
+from kcal import FileError, InputError, save_rig
 from kcal.cli.main import app
-from kcal.errors import FileError, InputError
-from kcal.io.rig_file import save_rig
 from kcal.lens.rig import Mounting
 from kcal.pipeline.stream import Stream
 from kcal.pipeline.tracks import TrackOptions
@@ -144,8 +143,7 @@ def test_what_is_wrong(
 
 def test_wrong_times_are_told(folder: Path) -> None:
     """One moment a day ahead and one in milliseconds leave all others as they are; a clock that is set is said."""
-    lines = (folder / "lines.jsonl").read_text().splitlines()
-    stamped = [json.loads(line) for line in lines[:20]]
+    stamped = [json.loads(line) for line in (folder / "lines.jsonl").read_text().splitlines()[:20]]
     texts = [json.dumps(line) for line in stamped]
     texts[10:10] = [json.dumps(stamped[10] | {"time": stamped[10]["time"] + 86400.0})]
     texts[5:5] = [json.dumps(stamped[5] | {"time": 1e13})]
@@ -209,8 +207,7 @@ def test_stations_into_files(tmp_path: Path) -> None:
     assert {row["cameras"] for row in rows if row["sequence"] == "9"} == {"tower 2 tower 3"}
     assert {row["told_from"] for row in rows} == {"tower 1"}
     last = sorted((float(row["east_m"]), float(row["north_m"])) for row in rows if row["sequence"] == "16")
-    true = sorted((start + 15.0 * velocity)[:, :2].tolist())
-    for found, wanted in zip(last, true, strict=True):
+    for found, wanted in zip(last, sorted((start + 15.0 * velocity)[:, :2].tolist()), strict=True):
         assert found == pytest.approx(wanted, abs=15.0)
     # Azimuths count from the tower: the first one stands east of the target, at its own vertical.
     assert 180.0 < float(rows[-1]["azimuth_deg"]) < 360.0

@@ -5,10 +5,9 @@ import pytest
 import torch
 from command_line import Command, rows_of
 
+from kcal import Camera, load_rig, save_rig
 from kcal.io.camera_file import provenance, save_camera
-from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.calibration import RigCalibration
-from kcal.lens.camera import Camera
 from kcal.lens.rig import REFRACTION, REFRACTION_SIGMA, Rig
 
 HEADER = "name,left_u,left_v,right_u,right_v\n"

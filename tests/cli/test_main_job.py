@@ -15,16 +15,12 @@ from command_line import Command, rows_of
 from typer.testing import CliRunner
 
 import kcal.sim.scene
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Board, Camera, DegenerateError, Observations, calibrate_camera
 from kcal.cli.console import more_views
 from kcal.cli.main import app
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
-from kcal.errors import DegenerateError
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
 from kcal.io.rig_file import RigFile
 from kcal.lens.calibration import CameraCalibration, LensSetting
-from kcal.lens.camera import Camera
 from kcal.lens.uncertainty import paraxial_focal
 
 # The main job from images to positions, through the command line as a user types it.

@@ -8,8 +8,7 @@ from command_line import Command, rows_of
 from rig_scenes import CAMERAS, CENTER, ROTATION, normal, spread_points
 from torch import Tensor
 
-from kcal.io.camera_file import save_camera
-from kcal.io.rig_file import load_rig
+from kcal import load_rig, save_camera
 from kcal.lens.calibration import CameraCalibration
 
 CAMERA, NOISE = CAMERAS[0], 0.1

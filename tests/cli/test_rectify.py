@@ -13,8 +13,7 @@ from command_line import Command
 from kcal import Camera, FileError, InputError, Rig, load_camera, load_rig, save_camera, save_rig
 from kcal.corners.images import decode_image
 from kcal.io.images import encode_png
-from kcal.lens import StereoRectification, Undistort
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import StereoRectification, Undistort, rotation_from_vector
 from kcal.lens.views import new_pinhole
 
 CAMERA = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.02, 1e-3, -1e-3])
@@ -190,8 +189,7 @@ def test_sides_of_a_rig(
         warnings.simplefilter("ignore")
         new = load_rig(folder / "out" / "rectified.rig.json")
     assert torch.allclose(new.right_from_left_translation, torch.tensor(place).double(), atol=1e-12)
-    again = StereoRectification(new)
-    assert torch.allclose(again.rotation, torch.eye(3).double(), atol=1e-12)
+    assert torch.allclose(StereoRectification(new).rotation, torch.eye(3).double(), atol=1e-12)
     assert np.allclose(np.load(folder / "out" / "Q.npy")[3, 2], 1.0 / -sum(place))
 
 

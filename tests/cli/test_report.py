@@ -109,8 +109,7 @@ def commands(app_or_group: Any, *path: str) -> list[tuple[str, ...]]:
     """All commands, as words."""
     found = []
     for name, command in app_or_group.commands.items():
-        inner = getattr(command, "commands", None)
-        found += commands(command, *path, name) if inner else [(*path, name)]
+        found += commands(command, *path, name) if getattr(command, "commands", None) else [(*path, name)]
     return found
 
 
@@ -149,8 +148,7 @@ def test_a_browser_shows_the_page_without_errors_and_requests(folder: Path, widt
     with chromium_page(width, height) as page:
         page.goto(page_file.as_uri())
         # The answer, why, and what to do fit one screen; nothing is wider than it.
-        header = page.locator("header").bounding_box()
-        assert header["height"] <= height
+        assert page.locator("header").bounding_box()["height"] <= height
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert page.locator(".answer").inner_text() == "NO"
         assert page.evaluate("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
@@ -229,5 +227,4 @@ def test_refusals(site_folder: Path, words: list[str], text: str) -> None:
 
 def test_ground_that_is_not_known_is_told(site_folder: Path) -> None:
     wide = "44.98,5.97,45.02,6.10"
-    text = run(site_folder, "towers.csv", "--area", wide, "--terrain", "hills.asc")
-    assert "no heights in" in text
+    assert "no heights in" in run(site_folder, "towers.csv", "--area", wide, "--terrain", "hills.asc")

@@ -11,14 +11,13 @@ from command_line import Command, rows_of
 from torch import Tensor
 from typer.testing import CliRunner
 
+from kcal import Camera, Origin
 from kcal.cli.main import app
 from kcal.cli.rig_sources import Sources, read_sources
 from kcal.io.camera_file import camera_to_file, save_camera
 from kcal.io.images import write_png
 from kcal.io.rig_file import RigFile, load_rig
-from kcal.lens.camera import Camera
 from kcal.lens.pose import enu_from_cam, rotation_from_vector, vector_from_rotation
-from kcal.lens.rig import Origin
 from kcal.locate.geodesy import enu_to_geodetic
 from kcal.locate.marks import read_marks, write_marks
 from kcal.locate.stations import station_mounting
@@ -157,14 +156,13 @@ def test_from_survey_to_positions(site: Path, command: Command) -> None:
 
 @pytest.mark.slow
 def test_landmarks_from_geojson_and_a_requirement(site: Path, command: Command) -> None:
-    rows = rows_of(site / "survey.csv")
     features = [
         {
             "type": "Feature",
             "properties": {"name": row["name"]},
             "geometry": {"type": "Point", "coordinates": [float(row[key]) for key in ("lon", "lat", "height")]},
         }
-        for row in rows
+        for row in rows_of(site / "survey.csv")
     ]
     (site / "survey.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     words = SOLVE.replace("survey.csv", "survey.geojson")
@@ -258,8 +256,7 @@ def test_check_by_landmarks(site: Path, command: Command) -> None:
     printed = command(arguments, "--relock rig.json", code=3)
     line = next(line for line in printed.out.splitlines() if line.startswith("right from left"))
     assert abs(float(line.split()[6]) - 0.02) < 4.5 * float(line.split()[8])
-    new = RigFile.load(site / "rig.json")
-    assert new.mounting.heading_deg == pytest.approx(16.0, abs=0.02)
+    assert RigFile.load(site / "rig.json").mounting.heading_deg == pytest.approx(16.0, abs=0.02)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from command_line import Command, invoked
 from typer.testing import CliRunner, Result
 
 import kcal
+from kcal import Camera, InputError, Rig, save_camera, save_rig
 from kcal.cli.board import _of_each_camera
 from kcal.cli.console import print_left_out
 from kcal.cli.demo import locate_again
@@ -23,13 +24,8 @@ from kcal.cli.demo_practice import _first
 from kcal.cli.main import app
 from kcal.cli.rig import camera_names
 from kcal.cli.rig_sources import READERS, RigReading, Sources, parse_baselines, read_sources
-from kcal.errors import InputError
-from kcal.io.camera_file import save_camera
 from kcal.io.images import write_png
-from kcal.io.rig_file import save_rig
 from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.rig import Rig
 from kcal.report.practice_score import _meters, _signed
 
 ROOT = Path(__file__).parents[2]

@@ -12,15 +12,10 @@ from click.testing import Result
 from command_line import Command, invoked, rows_of
 from typer.testing import CliRunner
 
+from kcal import Board, Camera, Observations, Origin, Rig, View, load_rig, save_camera, save_rig
 from kcal.cli.main import app
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations, View
 from kcal.errors import DegenerateError, FileError, InputError
-from kcal.io.camera_file import save_camera
-from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.camera import Camera
 from kcal.lens.pose import enu_from_cam, rotation_from_vector
-from kcal.lens.rig import Origin, Rig
 from kcal.locate.budget import station_sigmas
 from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
 from scripts.shared.station_scenes import ORIGIN, marks, ring, targets
@@ -212,8 +207,7 @@ def test_surveys_of_strangers(kcal_data: Path, tmp_path: Path, folder: str, came
         assert isinstance(as_given.exception, InputError | DegenerateError)
         assert not (tmp_path / "rig.json").exists()
         return
-    table = (here / "survey.csv").read_text()
-    (tmp_path / "survey.csv").write_text(table.replace("lon,lat", "lat,lon"))
+    (tmp_path / "survey.csv").write_text((here / "survey.csv").read_text().replace("lon,lat", "lat,lon"))
     right = solved(tmp_path / "survey.csv")
     assert right.exit_code == 0
     assert "mirror" not in right.output
@@ -265,8 +259,7 @@ def test_show_says_how_each_camera_stands() -> None:
     (line,) = [line for line in text.splitlines() if line.startswith("fisheye4 ")]
     rig = load_rig(stored)
     lat, lon = (float(word) for word in line.split()[1:3])
-    there = enu_to_geodetic(rig.center[1], rig.origin).tolist()
-    assert (lat, lon) == pytest.approx(there[:2], abs=1e-7)
+    assert (lat, lon) == pytest.approx(enu_to_geodetic(rig.center[1], rig.origin).tolist()[:2], abs=1e-7)
     assert "20 mm  50 mm" in line
 
 
@@ -331,8 +324,7 @@ def test_a_rig_of_four_is_judged(folder: Path, command: Command) -> None:
     cameras = [f"{name}.camera.json" for name in NAMES]
     given = ["--landmarks", "survey.csv", "--marks", "marks.csv", "-o", "rig.json"]
     more = ["--report", "rig.html", "--picture", "rig.png"]
-    text = run(folder, "rig", *cameras, *given, "--require", "5km:2%", *more)
-    assert "YES" in text
+    assert "YES" in run(folder, "rig", *cameras, *given, "--require", "5km:2%", *more)
     page = (folder / "rig.html").read_text()
     assert "mill" in page
     assert "data:image/png" in page
@@ -348,8 +340,7 @@ def test_a_rig_of_four_is_judged(folder: Path, command: Command) -> None:
     assert answer["sigma_m"] == pytest.approx(float(worst.total))
     # Turned away from each other, no two see the same.
     away = rig.rotation @ torch.diag(torch.tensor([-1.0, -1, 1], dtype=torch.float64))
-    apart = Rig(rig.each, NAMES, away, center=rig.center, origin=rig.origin)
-    save_rig(apart, folder / "apart.json")
+    save_rig(Rig(rig.each, NAMES, away, center=rig.center, origin=rig.origin), folder / "apart.json")
     result = command("report", folder / "apart.json", "--require 1km:5%", code=3)
     assert "no two cameras see one" in result.out
 

@@ -112,8 +112,7 @@ def test_stations_landmarks_and_images(command: Command) -> None:
     assert centers("b.rrd") == centers("a.rrd")
     assert centers("a.rrd")[0] == pytest.approx(target[0].tolist(), abs=1.0)
     command("view stations.json --site 19.07,72.87,14 --heading 35 -o c.rrd", code=2)
-    text = Path("positions.csv").read_text()
-    Path("positions.csv").write_text(text.replace("mill church", "mast church"))
+    Path("positions.csv").write_text(Path("positions.csv").read_text().replace("mill church", "mast church"))
     assert "this one has no camera 'mast'" in command.refuses("view stations.json positions.csv -o c.rrd")
 
 

@@ -17,9 +17,8 @@ from typer.testing import CliRunner
 from waiting import PATIENCE
 
 import kcal.watch.watcher as watcher_module
+from kcal import InputError, load_rig, save_rig
 from kcal.cli.main import app
-from kcal.errors import InputError
-from kcal.io.rig_file import load_rig, save_rig
 from kcal.lens.rig import Mounting, Origin
 from kcal.locate.budget import planned_rig
 from kcal.watch.history import history_head, history_line
@@ -93,8 +92,7 @@ def watched(tmp_path: Path) -> Path:
 def marks(folder: Path, times: list[str]) -> Path:
     """A target at 2 km, as the turned rig sees it, at some times."""
     rig = planned_rig()
-    point = torch.tensor([[0.0, 0.0, 2000.0]], dtype=torch.float64)
-    left, right = rig(point)[0].unbind(-2)
+    left, right = rig(torch.tensor([[0.0, 0.0, 2000.0]], dtype=torch.float64))[0].unbind(-2)
     right = right + torch.tensor([[1600.0 * math.tan(math.radians(0.01)), 0.0]])
     lines = ["name,left_u,left_v,right_u,right_v,time"]
     for k, time in enumerate(times):

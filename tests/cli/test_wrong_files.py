@@ -206,8 +206,7 @@ def test_the_only_fitting_file_of_a_folder_is_proposed(
 
 def test_views_of_another_camera_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
-    seen = Observations.load("seen.json")
-    seen.model_copy(update={"image_size": (1280, 720)}).save("small.json")
+    Observations.load("seen.json").model_copy(update={"image_size": (1280, 720)}).save("small.json")
     for line in (
         "report camera.json --observations small.json",
         "report rig.json --observations seen.json --observations small.json",
@@ -230,8 +229,7 @@ def test_views_of_the_left_camera_given_for_the_right_one_are_refused(
     for side in names:
         views = tuple(seen.views[0].model_copy(update={"name": f"{side}-{name}"}) for name in names[side])
         seen.model_copy(update={"views": views}).save(f"{side}.obs.json")
-    cameras = [load_camera("camera.json"), load_camera("right.json")]
-    for camera, side in zip(cameras, names, strict=True):
+    for camera, side in zip([load_camera("camera.json"), load_camera("right.json")], names, strict=True):
         record = dataclasses.replace(
             camera.calibration.record, per_view_rms={f"{side}-{name}": rms for name, rms in names[side].items()}
         )
@@ -360,8 +358,7 @@ def test_printing_is_the_default(tmp_path: Path, command: list[str]) -> None:
 
 def test_it_writes_what_it_says(tmp_path: Path, command: Command) -> None:
     camera = Camera.build(focal=(60, 60), center=(31, 24), size=(64, 48), coefficients=[-0.2, 0.02, 1e-3, -1e-3])
-    path = save_camera(camera, tmp_path / "left.camera.json")
-    said = command("bake", path, "--tolerance 1e-4").out
+    said = command("bake", save_camera(camera, tmp_path / "left.camera.json"), "--tolerance 1e-4").out
     lookup = load_lookup(tmp_path / "left_lookup.npz")
     assert lookup.source == camera.fingerprint
     assert max(lookup.bound) <= 1e-4

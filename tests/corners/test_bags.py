@@ -11,14 +11,11 @@ from bags import KINDS, START, Written, compressed, raw, write_bag
 from board_render import homography, render
 from command_line import Command
 
+from kcal import Board, FileError, InputError, KcalWarning, Observations, detect
 from kcal.bag import open_bag, pair_stamps
 from kcal.calibrate.rig.pairs import image_pairs, pair_by_name
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
 from kcal.corners.images import bag_images, decode_image, expand_images, image_bytes, image_time, read_gray
-from kcal.corners.observations import Observations
 from kcal.corners.video import detect_video, detect_videos, read_frames
-from kcal.errors import FileError, InputError, KcalWarning
 from kcal.file_kind import file_kind
 
 BOARD, SIZE = Board(columns=6, rows=5, square=0.02), (240, 200)
@@ -41,8 +38,7 @@ def colors() -> np.ndarray:
 
 def one(folder: Path, make, kind: str = "mcap") -> Path:  # type: ignore[no-untyped-def]
     """The only image of a bag."""
-    bag = write_bag(folder / f"one-{kind}.bag", kind, [(TOPIC, START, make)])
-    (path,) = expand_images([bag])
+    (path,) = expand_images([write_bag(folder / f"one-{kind}.bag", kind, [(TOPIC, START, make)])])
     return path
 
 
@@ -285,8 +281,7 @@ class TestDamage:
         bag = write_bag(tmp_path / "run.bag", "ros1", shots)
         data = bytearray(bag.read_bytes())
         # A chunk for each image: the header of the message in the last one.
-        place = data.rindex(b"conn=")
-        last = data.rindex(b"op=\x02", 0, place)
+        last = data.rindex(b"op=\x02", 0, data.rindex(b"conn="))
         data[last : last + 4] = b"xx=\x02"
         bag.write_bytes(data)
         with pytest.warns(KcalWarning, match="cannot be read further .* the 2 images before that are used"):

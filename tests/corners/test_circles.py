@@ -100,8 +100,7 @@ def test_diameter_is_measured_or_checked(papers):
     found, about = find_circles(image, CIRCLES)
     _, radius = refine_circles(image, found, CIRCLES, about)
     assert radius == pytest.approx(0.0055, rel=0.01)
-    told = Board.parse("circles:8x6:11mm", "22mm")
-    assert errors(detect_board(image, told).pixels, truth)[0] < 0.01
+    assert errors(detect_board(image, Board.parse("circles:8x6:11mm", "22mm")).pixels, truth)[0] < 0.01
     wrong = detect_board(image, Board.parse("circles:8x6:15mm", "22mm"))
     assert wrong.pixels is None
     assert "the circles are 10.9 mm wide where their distance is 22 mm, the board's are 15 mm" in wrong.reason
@@ -114,8 +113,7 @@ def test_light_circles_on_dark(papers):
 
 def test_sixteen_bits(papers):
     image, truth = papers[ASYMMETRIC].shoot(CAMERA, *pose(ASYMMETRIC, [0.3, 0.3, 0.0], 0.42))
-    found = detect_board(image.astype(np.uint16) * 257, ASYMMETRIC)
-    assert errors(found.pixels, truth)[0] < 0.01
+    assert errors(detect_board(image.astype(np.uint16) * 257, ASYMMETRIC).pixels, truth)[0] < 0.01
 
 
 @pytest.mark.parametrize("roll", [0.3, 1.9, 3.0, -1.4])
@@ -152,8 +150,7 @@ def test_covered_circle_becomes_unseen(papers):
 def test_a_part_of_the_board_is_not_the_board(papers):
     image, _ = papers[CIRCLES].shoot(CAMERA, *pose(CIRCLES, [0.2, 0.1, 0.0], 0.32))
     for text in ("circles:8x5", "circles:7x6"):
-        found = detect_board(image, Board.parse(text, "22mm"))
-        assert found.pixels is None, text
+        assert detect_board(image, Board.parse(text, "22mm")).pixels is None, text
 
 
 def test_wrong_target_says_what_was_seen(papers, tmp_path):

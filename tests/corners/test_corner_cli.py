@@ -21,16 +21,14 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 from waiting import PATIENCE
 
+from kcal import Board, FileError, InputError, Observations
 from kcal.cli.main import app
 from kcal.corners import detect as module
-from kcal.corners.board import Board
 from kcal.corners.detect import detect, detect_board
 from kcal.corners.images import exif_orientation, turned_images
-from kcal.corners.observations import Observations
 from kcal.corners.print_board import EDGE, PAGES, Drawing, Rectangle, Text, board_sheet, to_pdf, to_svg
 from kcal.corners.time_limit import Limited, TookTooLongError
 from kcal.corners.video import detect_video, read_frames
-from kcal.errors import FileError, InputError
 from kcal.report.calibration import coverage_figure, gallery_figure
 from kcal.threads import UNSTOPPABLE
 
@@ -149,8 +147,7 @@ def raster(drawing, per_mm=4):
 
 
 def svg_rectangles(text):
-    found = re.findall(r"M([-\d.]+) ([-\d.]+)h([-\d.]+)v([-\d.]+)h-[\d.]+z", text)
-    return np.array(found, dtype=float)
+    return np.array(re.findall(r"M([-\d.]+) ([-\d.]+)h([-\d.]+)v([-\d.]+)h-[\d.]+z", text), dtype=float)
 
 
 def pdf_rectangles(data, height):
@@ -172,8 +169,7 @@ def test_a4_board_has_its_true_size_in_both_formats():
     assert (squares[:, 3] == 25).all()
     assert squares[:, 0].max() + 25 - squares[:, 0].min() == pytest.approx(250, abs=1e-9)
     assert squares[:, 1].max() + 25 - squares[:, 1].min() == pytest.approx(175, abs=1e-9)
-    ruler = one[one[:, 2] == 100]
-    assert len(ruler) == 1
+    assert len(one[one[:, 2] == 100]) == 1
 
 
 def test_what_is_printed_is_what_is_detected():
@@ -225,8 +221,7 @@ def test_pages_are_those_of_the_standards():
     for name in ("A0", "A1", "A2", "A3", "A4", "A5"):
         assert PAGES[name] == (width, height), name
         width, height = height // 2, width
-    inches = {"letter": (8.5, 11.0), "legal": (8.5, 14.0), "tabloid": (11.0, 17.0)}
-    for name, (across, up) in inches.items():
+    for name, (across, up) in {"letter": (8.5, 11.0), "legal": (8.5, 14.0), "tabloid": (11.0, 17.0)}.items():
         assert PAGES[name] == pytest.approx((25.4 * across, 25.4 * up), rel=1e-12), name
 
 
@@ -255,8 +250,7 @@ def test_pdf_table_of_objects_is_right():
     for number, offset in enumerate(re.findall(rb"(\d{10}) 00000 n ", data), 1):
         assert data[int(offset) :].startswith(b"%d 0 obj\n" % number)
     length = int(re.search(rb"/Length (\d+)", data).group(1))
-    content = data.split(b"stream\n", 1)[1]
-    assert content[length:].startswith(b"\nendstream")
+    assert data.split(b"stream\n", 1)[1][length:].startswith(b"\nendstream")
 
 
 def test_texts_are_escaped():
@@ -291,8 +285,7 @@ def video(tmp_path_factory):
     places = [(-15, -10), (15, -10), (10, 12), (-15, -10)]
     for place in places:
         for i in range(7):
-            image = still(place, 0.8 if i == 2 else 3.0, seed=i)[0]
-            writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+            writer.write(cv2.cvtColor(still(place, 0.8 if i == 2 else 3.0, seed=i)[0], cv2.COLOR_GRAY2BGR))
     writer.release()
     return path, places
 
@@ -345,8 +338,7 @@ def stream(video):
         ("127.0.0.1", 0),
         lambda *a: Quiet(*a, directory=str(path.parent)),  # type: ignore[arg-type]
     )
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
+    threading.Thread(target=server.serve_forever, daemon=True).start()
     yield f"http://user:secret@127.0.0.1:{server.server_address[1]}/{path.name}"
     server.shutdown()
     server.server_close()

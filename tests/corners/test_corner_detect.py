@@ -33,8 +33,7 @@ SMALL = Board(columns=6, rows=5, square=0.02)
 
 
 def scene(board, size, square, **options):
-    H = homography(board, size, square, (0.1, 0.05), 0.1, (0.3, 0.2))
-    return render(board, size, H, **options)
+    return render(board, size, homography(board, size, square, (0.1, 0.05), 0.1, (0.3, 0.2)), **options)
 
 
 def rms(pixels, truth):
@@ -99,8 +98,7 @@ def test_nothing_there():
 
 
 def test_a_part_of_the_board_is_not_the_board():
-    H = homography(BOARD, (640, 480), 25, (0.2, 0.1), 0.1)
-    image, _ = render(BOARD, (640, 480), H, supersample=2)
+    image, _ = render(BOARD, (640, 480), homography(BOARD, (640, 480), 25, (0.2, 0.1), 0.1), supersample=2)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     assert cv2.findChessboardCorners(image, (8, 6), flags=flags)[0]  # OpenCV is content with a part
     found = detect_board(image, Board(columns=8, rows=6, square=0.025))
@@ -358,8 +356,7 @@ def test_local_side():
 @pytest.mark.parametrize("degrees", [0, 40, 180])
 @pytest.mark.parametrize("part", ["left", "right", "top", "bottom", "middle"])
 def test_part_of_a_larger_board_is_refused(part, degrees):
-    board = Board(columns=7, rows=6, square=0.02)
-    image, truth = flat(board, degrees)
+    image, truth = flat(Board(columns=7, rows=6, square=0.02), degrees)
     cut = {
         "left": (slice(None), slice(0, 6)),
         "right": (slice(None), slice(1, 7)),
@@ -391,8 +388,7 @@ def test_the_whole_board_is_accepted_on_any_background(surround, tilt):
 
 
 def test_wrong_grids_are_refused_with_a_reason():
-    board = Board(columns=6, rows=5, square=0.02)
-    image, truth = flat(board, 15)
+    image, truth = flat(Board(columns=6, rows=5, square=0.02), 15)
     grid = truth.reshape(5, 6, 2)
 
     def trouble(changed, picture=image):
@@ -423,8 +419,7 @@ def test_strong_barrel_distortion_is_no_reason_to_refuse():
     x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
     direction = np.stack([x - 110, y - 110], -1) / 90
     length = np.linalg.norm(direction, axis=-1, keepdims=True).clip(1e-9, 1.4)
-    seen = np.tan(length) / 1.1 / length * direction * 4 + np.array([4.0, 3.0])
-    cell = np.floor(seen).astype(int)
+    cell = np.floor(np.tan(length) / 1.1 / length * direction * 4 + np.array([4.0, 3.0])).astype(int)
     on_board = (cell >= -1).all(-1) & (cell[..., 0] < 9) & (cell[..., 1] < 7)
     image = np.where(on_board & (cell.sum(-1) % 2 == 0), 40, 215).astype(np.uint8)
     assert grid_trouble(image, bent, 9, 7) is None
@@ -473,8 +468,7 @@ def part_rms(pixels, truth):
 def test_a_board_cut_by_the_image_keeps_its_numbers(shift):
     image, truth = picture(shift=shift)
     found = detect_board(image, BOARD)
-    seen = torch.isfinite(found.pixels).all(-1)
-    assert 20 <= int(seen.sum()) < 54
+    assert 20 <= int(torch.isfinite(found.pixels).all(-1).sum()) < 54
     # A part one column off would be wrong by a square of 30 px.
     assert part_rms(found.pixels, truth) < 0.03
 
@@ -484,8 +478,7 @@ def test_glare_leaves_out_corners_only():
     y, x = np.mgrid[: PART_SIZE[1], : PART_SIZE[0]]
     u, v = truth[22].tolist()
     spot = 500 * np.exp(-0.5 * (((x - u) / 22) ** 2 + ((y - v) / 18) ** 2))
-    glaring = np.clip(image + spot, 0, 255).astype(np.uint8)
-    found = detect_board(glaring, BOARD)
+    found = detect_board(np.clip(image + spot, 0, 255).astype(np.uint8), BOARD)
     assert 30 <= int(torch.isfinite(found.pixels).all(-1).sum()) < 54
     assert bool(found.pixels[22].isnan().all())
     assert float((found.pixels - truth).norm(dim=-1).nan_to_num().max()) < 1.0
@@ -505,20 +498,17 @@ def test_an_uncertain_part_is_refused_with_its_side():
 
 def test_the_edge_of_a_cover_is_not_the_end_of_the_board():
     """A gray sheet hides the last columns along a line of the board, and the first ones are outside the image."""
-    H = homography(BOARD, PART_SIZE, 30, shift=(-165, 0))
-    image, truth = render(BOARD, PART_SIZE, H, supersample=2)
+    image, truth = render(BOARD, PART_SIZE, homography(BOARD, PART_SIZE, 30, shift=(-165, 0)), supersample=2)
     image[:, round(float(truth[6, 0])) + 30 :] = 120
     grid = truth.reshape(6, 9, 2)[:, 3:7]
     assert board_ends(image, grid)[3]
     assert not board_ends(image, grid, paper=True)[3]
-    found = detect_board(image, BOARD)
-    assert found.pixels is None
+    assert detect_board(image, BOARD).pixels is None
 
 
 def test_sharpened_edges_lose_no_corners():
     light, truth = picture(blur=0.3, noise=0, dtype=np.float64)
-    soft = cv2.GaussianBlur(light, (0, 0), 1.2)
-    image = np.clip(40 + 0.5 * (light + 1.5 * (light - soft)), 0, 255)
+    image = np.clip(40 + 0.5 * (light + 1.5 * (light - cv2.GaussianBlur(light, (0, 0), 1.2))), 0, 255)
     packed = cv2.imencode(".jpg", np.rint(image).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 75])[1]
     found = detect_board(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), BOARD)
     assert int(torch.isfinite(found.pixels).all(-1).sum()) == 54

@@ -11,15 +11,10 @@ import torch
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from kcal import Board, FileError, InputError
 from kcal.corners import detect as module
-from kcal.corners.board import Board
 from kcal.corners.circles import find_circles
-from kcal.corners.detect import (
-    detect,
-    refuse_other_board,
-    seen_by_most,
-    too_few,
-)
+from kcal.corners.detect import detect, refuse_other_board, seen_by_most, too_few
 from kcal.corners.images import decode_gray, expand_images, image_time, read_gray, to_8bit, unique_names
 from kcal.corners.markers import opencv_dictionary
 from kcal.corners.observations import View, common_size, rescaled, resized_alike
@@ -28,7 +23,6 @@ from kcal.corners.refine import refine_corners
 from kcal.corners.saddle import CornerStatus, Refined
 from kcal.corners.search import NotFoundError
 from kcal.corners.video import VideoFrames
-from kcal.errors import FileError, InputError
 
 
 @pytest.fixture
@@ -211,8 +205,7 @@ def test_corners_of_a_smaller_image_are_those_of_the_whole_one(folder) -> None:
     assert notes == [
         "images of several sizes: corners were scaled to 720x540 px of most images: c.png from 240x180 px by 3"
     ]
-    alone = detect([folder / "c.png"], BOARD)
-    small, large = alone.covariances(), seen.covariances()
+    small, large = detect([folder / "c.png"], BOARD).covariances(), seen.covariances()
     torch.testing.assert_close(large[2], 9.0 * small[0], rtol=1e-9, atol=0)
 
 
@@ -355,8 +348,7 @@ class TestOtherBoards:
     ])  # fmt: skip
     def test_another_checkerboard(self, found: tuple[int, int] | None, told: str) -> None:
         assert instead(BLANK, self.BOARD, found) == told
-        tall = Board(columns=6, rows=9, square=0.025)
-        assert instead(BLANK, tall, found) == told
+        assert instead(BLANK, Board(columns=6, rows=9, square=0.025), found) == told
 
     def test_a_checkerboard_in_place_of_markers(self) -> None:
         """Of the same size too: its markers are missing."""
@@ -384,8 +376,7 @@ class TestOtherBoards:
         assert seen_markers(markers("4x4_250", 3, 60), self.BOARD) == ""
 
     def test_the_larger_of_dictionaries(self) -> None:
-        page = markers("5x5_250", 3, 60, 7, 9)
-        assert "3 to 60 of dictionary 5x5_100" in seen_markers(page, self.BOARD)
+        assert "3 to 60 of dictionary 5x5_100" in seen_markers(markers("5x5_250", 3, 60, 7, 9), self.BOARD)
 
     def test_tags(self) -> None:
         page = markers("apriltag_36h11", 0, 1, 2, 5, border=2)

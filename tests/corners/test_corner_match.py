@@ -28,8 +28,7 @@ class TestEnlarge:
         assert view.from_image(pixels[1]).tolist() == [4.5, 4.5]
 
     def test_a_ramp_keeps_its_place(self):
-        image = torch.arange(60.0, dtype=torch.float64).expand(40, 60)
-        view = enlarge(image, torch.tensor([30.0, 20.0]))
+        view = enlarge(torch.arange(60.0, dtype=torch.float64).expand(40, 60), torch.tensor([30.0, 20.0]))
         x = torch.arange(view.patch.shape[1], dtype=torch.float64)
         at = view.to_image(torch.stack([x, torch.zeros_like(x)], -1))[:, 0]
         # Bilinear interpolation reproduces a ramp, but not in the outermost half pixels of the crop.
@@ -119,8 +118,7 @@ def stereo(noise=0.0, seed=0):
 
 def truth_of(rig, pixels, distance):
     normalized, _ = rig.left.normalize(pixels)
-    points = torch.cat([normalized, torch.ones_like(normalized[:, :1])], -1) * distance
-    return rig(points)[0][..., 1, :]
+    return rig(torch.cat([normalized, torch.ones_like(normalized[:, :1])], -1) * distance)[0][..., 1, :]
 
 
 PIXELS = torch.tensor([[160.0, 120.0], [110.4, 80.7], [220.2, 170.9], [130.5, 160.5]], dtype=torch.float64)

@@ -92,8 +92,7 @@ class TestGrid:
         assert bool((_corner_areas(grid) > 0).all())
         assert bool((_corner_areas(grid.flip(0)) < 0).all())
         # Parallelograms: twice the area of each triangle is that of the square.
-        plain = squares(4, 4)[1]
-        assert _corner_areas(plain).unique().tolist() == [SQUARE**2]
+        assert _corner_areas(squares(4, 4)[1]).unique().tolist() == [SQUARE**2]
         # A corner of a regular grid that is off by a tenth of a square, least squares of its blocks.
         moved = squares(6, 6)[1].clone()
         moved[0, 0, 0] += 2.0
@@ -130,8 +129,7 @@ class TestGrid:
         image[:30], image[-30:], image[:, :30], image[:, -30:] = 20, 20, 20, 20
         step = torch.tensor([0.0, 20.0]).double()
         for line, side in ((torch.cat([grid[:1] - step, grid]), 0), (torch.cat([grid, grid[-1:] + step]), 1)):
-            found = false_sides(image, line)
-            assert found.tolist() == [k == side for k in range(4)]
+            assert false_sides(image, line).tolist() == [k == side for k in range(4)]
             kept = without_false_sides(image, line)
             assert kept is not None
             torch.testing.assert_close(kept, grid)
@@ -175,8 +173,7 @@ class TestGrid:
         # Without a second one: the mirror image of the first.
         unknown = torch.full_like(following, math.nan)
         torch.testing.assert_close(_beyond(step[:, None], unknown[:, None])[0, 0], -step[0])
-        values = torch.tensor([[1.0], [3.0], [9.0]]).double()
-        assert _change(values)[:, 0].tolist() == [2.0, 4.0, 6.0]
+        assert _change(torch.tensor([[1.0], [3.0], [9.0]]).double())[:, 0].tolist() == [2.0, 4.0, 6.0]
 
     def test_grids_grow_and_are_filled(self) -> None:
         image, grid = squares(8, 7)

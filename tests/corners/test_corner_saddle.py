@@ -13,8 +13,7 @@ from board_render import homography, render
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kcal import Board, Camera, InputError, detect
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal import Board, CalibrationOptions, Camera, InputError, calibrate_camera, detect
 from kcal.corners.erf import erf_saddle
 from kcal.corners.erf_board import NAMES, LineDistances, crossing
 from kcal.corners.grid import line_bend, local_side, neighbors
@@ -156,8 +155,7 @@ def test_gradient_with_respect_to_the_image():
     start = torch.tensor([[16.0, 16.0]], dtype=torch.float64)
 
     def corner(center):
-        canvas = torch.nn.functional.pad(center, (14, 14, 14, 14)) + image
-        return saddle(canvas, start, 20.0).pixels
+        return saddle(torch.nn.functional.pad(center, (14, 14, 14, 14)) + image, start, 20.0).pixels
 
     # Bilinear sampling has kinks, none of them within the finite difference here.
     assert torch.autograd.gradcheck(corner, (torch.zeros(5, 5, dtype=torch.float64, requires_grad=True),), eps=1e-6)
@@ -166,8 +164,7 @@ def test_gradient_with_respect_to_the_image():
 @pytest.mark.parametrize("by", [saddle, erf_saddle])
 def test_gradient_is_finite_with_bad_corners_about(by):
     image = torch.rand(50, 50, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    start = torch.tensor([[25.0, 25.0], [math.nan, 3.0], [1.0, 1.0]], dtype=torch.float64)
-    found = by(image, start, 20.0)
+    found = by(image, torch.tensor([[25.0, 25.0], [math.nan, 3.0], [1.0, 1.0]], dtype=torch.float64), 20.0)
     found.pixels.nan_to_num().sum().backward()
     assert bool(torch.isfinite(image.grad).all())
 
@@ -366,8 +363,7 @@ class TestFit:
         # Through strong barrel distortion the lines through an outer corner bend to one side.
         camera = Camera.build(focal=(420, 420), center=(319.5, 239.5), size=(640, 480), coefficients=[-0.3, 0.1])
         size = BoardSize(5, 4, 0.02)
-        turn = torch.eye(3, dtype=torch.float64)
-        pose = turn, torch.tensor([0.07, 0.04, 0.22], dtype=torch.float64)
+        pose = torch.eye(3, dtype=torch.float64), torch.tensor([0.07, 0.04, 0.22], dtype=torch.float64)
         truth, visible = project_board(camera, pose, size)
         light = render_light(camera, pose, size, RenderOptions(blur=0.8, vignetting=0))
         side = local_side(truth, 5, 4)
@@ -382,8 +378,7 @@ class TestFit:
         # Light that grows to one side makes the squares there count more; the whole board tells by how much.
         image, truth, start, side = edge_scene(10, noise=0, supersample=8, dtype=np.float64)
         y, x = np.mgrid[: image.shape[0], : image.shape[1]]
-        shaded = torch.from_numpy(image * (1 + 0.003 * x - 0.002 * y))
-        found = erf_saddle(shaded, start, side)
+        found = erf_saddle(torch.from_numpy(image * (1 + 0.003 * x - 0.002 * y)), start, side)
         # The renderer's sampling alone is some 0.001.
         assert float((found.pixels - truth).square().mean().sqrt()) < 0.002
 
@@ -404,8 +399,7 @@ class TestFit:
 
     def test_tone_curve_does_not_move_the_corner(self):
         image, truth, start, side = edge_scene(20, noise=0, supersample=8, dtype=np.float64)
-        curved = 255 * (torch.from_numpy(image) / 255) ** 0.45
-        found = erf_saddle(curved, start, side)
+        found = erf_saddle(255 * (torch.from_numpy(image) / 255) ** 0.45, start, side)
         assert bool((found.status == CornerStatus.GOOD).all())
         # 0.001 without the curve: the renderer's sampling.
         assert float((found.pixels - truth).square().mean().sqrt()) < 0.002
@@ -561,12 +555,11 @@ class TestNeighbors:
         squares = np.concatenate([bigger.points[:, :2].numpy() / 0.02, np.ones((42, 1))], 1) @ H.T
         all_corners = torch.from_numpy(squares[:, :2] / squares[:, 2:]).reshape(6, 7, 2)
         torch.testing.assert_close(all_corners[1:-1, 1:-1].reshape(-1, 2), truth, rtol=0, atol=1e-9)
-        middle = all_corners[1:-1, 1:-1]
         wanted = (
             torch.stack(
                 [all_corners[1:-1, :-2], all_corners[1:-1, 2:], all_corners[:-2, 1:-1], all_corners[2:, 1:-1]], 2
             )
-            - middle[:, :, None]
+            - all_corners[1:-1, 1:-1][:, :, None]
         )
         miss = (around.step - wanted.reshape(-1, 4, 2)).norm(dim=-1)
         # Of 14 to 31 px: c is not quite the same on all lines.

@@ -142,8 +142,7 @@ class TestCorners:
         window = with_levels(window, lights[:, None] * crossing(common, window.where, bend)[0])
         usable = torch.tensor([[True, True, True, False]])
         own[:, 9] = common[:, 9]  # its median is what counts
-        light = light_at(own, window, bend, None, usable)
-        torch.testing.assert_close(light[0], lights)
+        torch.testing.assert_close(light_at(own, window, bend, None, usable)[0], lights)
 
     def test_errors_of_the_next_lines_move_a_corner(self) -> None:
         """By the derivative of its gray levels by their distances; neighbors' errors are as large as its own."""
@@ -195,8 +194,7 @@ class TestCorners:
         root = window.weight[0].sqrt().numpy()
         best = np.linalg.lstsq(design * root[:, None], levels[0].numpy() * root, rcond=None)[0]
         assert parameters[0, 5:7].tolist() == pytest.approx(best.tolist())
-        bowl = with_levels(window, (x * x + 0.5 * y * y)[None])
-        assert not bool(_start(bowl)[1].any())
+        assert not bool(_start(with_levels(window, (x * x + 0.5 * y * y)[None]))[1].any())
         for radius, blur in ((2.5, 0.6), (12.0, 1.5)):
             wide = windows_about(offset, radius)
             assert float(_start(with_levels(wide, levels))[0][0, 4].exp()) == pytest.approx(blur)

@@ -82,8 +82,7 @@ class TestWholeBoards:
         low = np.delete(image, slice(62, 67), 0)
         low = np.concatenate([low, low[-5:]])  # the same size
         whole, grid = seen_from(turn, low, grid - torch.tensor([0.0, 5.0]))
-        part = (grid[1:], grid[:-1], grid[:, 1:], grid[:, :-1])[turn]
-        assert goes_on(whole, part)
+        assert goes_on(whole, (grid[1:], grid[:-1], grid[:, 1:], grid[:, :-1])[turn])
 
     @pytest.mark.parametrize("turn", range(4))
     def test_an_outer_line_needs_a_third_of_the_contrast_outside(self, turn: int) -> None:
@@ -91,8 +90,7 @@ class TestWholeBoards:
             signs = alternating(7, 6)
             signs[0] *= share
             image, grid = seen_from(turn, *picture(signs, ground=0.0))
-            found = false_sides(image, grid)
-            assert found.tolist() == [false and k == turn for k in range(4)]
+            assert false_sides(image, grid).tolist() == [false and k == turn for k in range(4)]
 
     @pytest.mark.parametrize("turned", [False, True])
     def test_a_line_is_skipped_where_four_colors_meet_between(self, turned: bool) -> None:
@@ -119,8 +117,7 @@ class TestWholeBoards:
         if not meet:
             image[50:70, 50:70] = 120  # at one corner
         assert (uneven(image, moved) is None) is even
-        turned = moved.transpose(0, 1).flip(-1)
-        assert (uneven(np.ascontiguousarray(image.T), turned) is None) is even
+        assert (uneven(np.ascontiguousarray(image.T), moved.transpose(0, 1).flip(-1)) is None) is even
 
     @pytest.mark.parametrize("axis", [0, 1])
     def test_a_corner_may_be_off_where_squares_meet(self, axis: int) -> None:
@@ -263,8 +260,7 @@ class TestParts:
     def test_grids_grow_up_to_the_lines_that_are_asked_for(self) -> None:
         image, grid = picture(alternating(9, 10))
         for most in (4, 5, 20):
-            grown = grown_grid(image, grid[2:5, 3:6], most)
-            size = grown.shape[:2]
+            size = grown_grid(image, grid[2:5, 3:6], most).shape[:2]
             # One line on either side a time, until there are more, or no more.
             assert size == ((5, 5) if most == 4 else (7, 7) if most == 5 else (8, 9))
         for number, side in enumerate(sides(grid)):

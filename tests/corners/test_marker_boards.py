@@ -61,8 +61,7 @@ def test_two_grids_in_one_image(paper):
     ]
     image = expose(light_of(scenes, CAMERA), *CAMERA.size)
     for board, scene in ((BOARD, scenes[0]), (other, scenes[1])):
-        truth = points_of(board, CAMERA, *scene[1:])
-        rms, most, count = errors(detect_board(image, board).pixels, truth)
+        rms, most, count = errors(detect_board(image, board).pixels, points_of(board, CAMERA, *scene[1:]))
         assert count >= board.corners - 8
         assert rms < 0.03
         assert most < 0.1
@@ -116,11 +115,9 @@ def test_tags_with_a_border_of_one_cell():
         row, column = divmod(number, 3)
         y, x = 40 + gap + (1 - row) * pitch, 40 + gap + column * pitch
         page[y : y + side, x : x + side] = opencv_dictionary("apriltag_36h11").generateImageMarker(number, side)
-    image = cv2.GaussianBlur(page, (0, 0), 0.8)
-    found = detect_board(image, board)
+    found = detect_board(cv2.GaussianBlur(page, (0, 0), 0.8), board)
     origin = torch.tensor([40.0 + gap - 0.5, 40.0 + gap + pitch + side - 0.5], dtype=torch.float64)
-    truth = board.points[:, :2] * (1000 * side / 40) + origin
-    rms, most, count = errors(found.pixels, truth)
+    rms, most, count = errors(found.pixels, board.points[:, :2] * (1000 * side / 40) + origin)
     assert count == 24
     assert rms < 0.02
     assert most < 0.05
@@ -282,8 +279,7 @@ class TestDetection:
         assert detect_board(image, CHARUCO).pixels is None
 
     def test_window_ends_before_the_marker(self):
-        pixels = CHARUCO.points[:, :2] * 1000
-        side = free_side(pixels, CHARUCO)
+        side = free_side(CHARUCO.points[:, :2] * 1000, CHARUCO)
         # From the corner to the marker's own corner: 3.75 mm along each axis.
         assert float(side[0]) * 0.5 < 3.75 * np.sqrt(2)
         assert float(side[0]) * 0.5 > 0.7 * 3.75 * np.sqrt(2)
@@ -355,11 +351,9 @@ def test_images_that_do_not_tell_follow_the_others(tmp_path):
     assert find_charuco(part, board)[1] is None
     cv2.imwrite(str(tmp_path / "a.png"), part)
     cv2.imwrite(str(tmp_path / "b.png"), image)
-    seen = detect([tmp_path / "a.png", tmp_path / "b.png"], board)
-    for pixels in seen.pixels():
+    for pixels in detect([tmp_path / "a.png", tmp_path / "b.png"], board).pixels():
         assert errors(pixels, truth)[1] < 0.05
-    alone = detect([tmp_path / "a.png"], board)
-    assert errors(alone.pixels()[0], truth)[1] == pytest.approx(SIDE, abs=0.1)
+    assert errors(detect([tmp_path / "a.png"], board).pixels()[0], truth)[1] == pytest.approx(SIDE, abs=0.1)
 
 
 def test_images_of_two_numberings_are_refused(tmp_path):

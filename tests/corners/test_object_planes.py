@@ -72,8 +72,7 @@ class TestPlanes:
     def test_what_has_no_plane_is_said(self) -> None:
         left, right = RIG(self.POINTS[:3])[0].unbind(-2)
         left[0], right[1] = math.nan, math.nan
-        planes = object_planes(RIG, left, right, torch.zeros(3))
-        assert planes.valid.tolist() == [False, False, True]
+        assert object_planes(RIG, left, right, torch.zeros(3)).valid.tolist() == [False, False, True]
 
 
 def texture(seed: int, size: int = 72) -> Tensor:
@@ -85,11 +84,9 @@ def texture(seed: int, size: int = 72) -> Tensor:
 def patches(shift: tuple[float, float], gain: float = 1.0, half: int = 8) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Template, image, places at zero shift and slopes: the image shows the template moved by `shift`."""
     image = texture(3)
-    middle = tensor([36.0, 36.0])
-    places = middle[:, None, None] + grid_of((half, half), image.device)[None]
+    places = tensor([36.0, 36.0])[:, None, None] + grid_of((half, half), image.device)[None]
     slopes = torch.eye(2, dtype=torch.float64).expand(1, 2 * half + 1, 2 * half + 1, 2, 2)
-    windows = image_windows(image, places, 0, math.inf)
-    template = (sample(windows, places + tensor(*shift)) - 10.0) / gain
+    template = (sample(image_windows(image, places, 0, math.inf), places + tensor(*shift)) - 10.0) / gain
     return template, image, places, slopes
 
 
@@ -152,8 +149,7 @@ class TestShifts:
         image, generator = texture(3, 600), torch.Generator().manual_seed(6)
         middle = 20.0 + 560.0 * torch.rand(300, 1, 1, 2, generator=generator, dtype=torch.float64)
         places = middle + grid_of((half, half), image.device)
-        noise = torch.randn(2, *image.shape, generator=generator, dtype=torch.float64)
-        first, second = image + 12.0 * noise
+        first, second = image + 12.0 * torch.randn(2, *image.shape, generator=generator, dtype=torch.float64)
         slopes = torch.eye(2, dtype=torch.float64).expand(*places.shape, 2)
         found = fitted(sample(image_windows(first, places, 0, math.inf), places), second, places, slopes)
         ratio = (found.shift / found.covariance.diagonal(dim1=1, dim2=2).sqrt())[found.converged]
@@ -214,8 +210,7 @@ class TestKeypoints:
     def test_a_shifted_image_has_them_shifted(self) -> None:
         image = texture(7, 240).clamp(0, 255).numpy().astype(np.uint8)
         first, second = (keypoints(part, 200) for part in (image[:200, :200], image[10:210, 20:220]))
-        nearest = (first.descriptors @ second.descriptors.T).argmax(1)
-        moved = first.pixels - second.pixels[nearest]
+        moved = first.pixels - second.pixels[(first.descriptors @ second.descriptors.T).argmax(1)]
         assert moved.median(0).values.tolist() == pytest.approx([20.0, 10.0], abs=0.05)
 
     def test_an_empty_image_has_none(self) -> None:
@@ -256,8 +251,7 @@ class TestAgain:
 
     def test_what_went_farther_than_the_reach_is_not_found(self) -> None:
         after = self.IMAGE.roll((0, 9), (0, 1))
-        far = find_again(self.IMAGE, after, tensor([80.0, 60.0]), reach=6)
-        assert int(far.status[0]) != MatchStatus.GOOD
+        assert int(find_again(self.IMAGE, after, tensor([80.0, 60.0]), reach=6).status[0]) != MatchStatus.GOOD
         assert find_again(self.IMAGE, after, tensor([80.0, 60.0]), reach=10).status.tolist() == [MatchStatus.GOOD]
 
     def test_refusals_and_what_has_no_texture(self) -> None:

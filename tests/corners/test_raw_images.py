@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kcal.corners.board import Board
-from kcal.corners.detect import detect
+from kcal import Board, FileError, detect
 from kcal.corners.images import decode_gray, decode_image, image_header, read_gray
-from kcal.errors import FileError
 from kcal.file_kind import file_kind
 from kcal.io.images import write_png
 from tests.corners.test_recognize import TILTS, shots
@@ -74,8 +72,7 @@ def test_levels_are_linear_and_white_is_gray(tmp_path: Path) -> None:
     ramp = np.tile(np.linspace(10, 250, 64), (48, 1))
     colors = decode_image(dng(mosaic(ramp)), "a.dng")
     assert (colors.dtype, colors.shape) == (np.uint16, (48, 64, 3))
-    inside = colors[4:-4, 4:-4].astype(float)
-    assert np.abs(inside / 65535 - ramp[4:-4, 4:-4, None] / 255).max() < 2e-3
+    assert np.abs(colors[4:-4, 4:-4].astype(float) / 65535 - ramp[4:-4, 4:-4, None] / 255).max() < 2e-3
     (tmp_path / "a.dng").write_bytes(dng(mosaic(ramp)))
     gray = read_gray(tmp_path / "a.dng")
     assert (gray.dtype, gray.shape) == (np.uint16, (48, 64))

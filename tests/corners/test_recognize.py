@@ -11,8 +11,7 @@ from command_line import Command
 from numpy.typing import NDArray
 from PIL import Image
 
-from kcal import Board, Camera, InputError, Observations, detect
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Board, Camera, InputError, Observations, calibrate_camera, detect
 from kcal.corners import detect_board, recognize_board
 from kcal.corners.images import decode_gray, decode_image, exif_orientation, expand_images, image_header
 from kcal.corners.recognize import (
@@ -59,8 +58,7 @@ def test_boards_are_recognized(text: str, square: str, distance: float) -> None:
 
 def test_rows_that_one_image_cuts_another_shows() -> None:
     """A part of a board with markers votes as well; it does not make the board smaller."""
-    board = Board.parse("charuco:9x6:5x5_100", "25mm")
-    upper = shots(board, 0.4, TILTS[0])[0]
+    upper = shots(Board.parse("charuco:9x6:5x5_100", "25mm"), 0.4, TILTS[0])[0]
     lower, middle = upper.copy(), upper.shape[0] // 2
     upper[middle + 40 :] = 200
     lower[: middle - 40] = 200
@@ -135,8 +133,7 @@ def test_a_false_hit_does_not_make_another_board(kcal_data: Path, tmp_path: Path
     assert detect_board(shots(Board.parse("9x6", "25mm"), 0.4, TILTS[0])[0], wrong).pixels is None
     with pytest.raises(InputError, match=r"the board is in 1 of 4 images only; .* give --board 7x7"):
         detect(files, wrong)
-    output = tmp_path / "x.obs.json"
-    result = command("detect", *files, "--square 25mm -o", output)
+    result = command("detect", *files, "--square 25mm -o", tmp_path / "x.obs.json")
     assert "board 7x7, seen in " in result.err
     assert "board found in 4 of 4 images" in result.out
 
@@ -197,16 +194,14 @@ def test_raw_and_heic_images_of_a_folder_are_named_with_what_to_do(
             pytest.importorskip(module)
         else:
             monkeypatch.setitem(sys.modules, module, None)
-    page = shots(Board.parse("9x6", "25mm"), 0.4, TILTS[0])[0]
-    write_png(tmp_path / "a.png", page)
+    write_png(tmp_path / "a.png", shots(Board.parse("9x6", "25mm"), 0.4, TILTS[0])[0])
     for name in ("a.CR2", "b.CR2", "c.heic"):
         (tmp_path / name).write_bytes(
             bytes(3) + b"\x18ftypheic" + bytes(100) if "heic" in name else b"II*\0" + bytes(99)
         )
     # The raw image of which a picture is there is not a failure of its own.
     assert [path.name for path in expand_images([tmp_path])] == ["a.png", "b.CR2", "c.heic"]
-    seen = detect(tmp_path, Board.parse("9x6", "25mm"), note=lambda _: None)
-    raw, heic = seen.failures
+    raw, heic = detect(tmp_path, Board.parse("9x6", "25mm"), note=lambda _: None).failures
     assert (raw.name, heic.name) == ("b.CR2", "c.heic")
     words = ("a raw image that LibRaw cannot read", "the image is truncated or corrupt") if there else (
         "a raw image, which needs one more package: pip install 'kcal[images]'",

@@ -126,8 +126,7 @@ def test_turns_that_look_alike(text, turns):
     for turn in turns:
         # The points, turned and in the order that is then read, are the board's points again.
         angle = torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=torch.float64)  # x becomes -y, y becomes x
-        order = torch.rot90(grid, turn).flatten()
-        turned = flat[order] @ torch.linalg.matrix_power(angle, turn).T
+        turned = flat[torch.rot90(grid, turn).flatten()] @ torch.linalg.matrix_power(angle, turn).T
         middle = 0.5 * (flat.amax(0) + flat.amin(0))
         again = 0.5 * (turned.amax(0) + turned.amin(0))
         assert torch.allclose(turned - again, flat - middle, atol=1e-12), turn
@@ -172,8 +171,7 @@ class TestKalibrFiles:
         return Board.parse(str(path), square)
 
     def test_targets(self, tmp_path):
-        april = self.parse(tmp_path, self.APRIL)
-        assert april == Board.parse("aprilgrid:6x5:0.3", "88mm")
+        assert self.parse(tmp_path, self.APRIL) == Board.parse("aprilgrid:6x5:0.3", "88mm")
         checks = "target_type: checkerboard\ntargetCols: 6\ntargetRows: 7\nrowSpacingMeters: 0.06\ncolSpacingMeters: "
         assert self.parse(tmp_path, checks + "0.06\n") == Board.parse("6x7", "60mm")
         circles = "target_type: circlegrid\ntargetCols: 4\ntargetRows: 11\nspacingMeters: 0.02\nasymmetricGrid: "

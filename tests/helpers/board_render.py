@@ -33,8 +33,7 @@ def render(board, size, H, blur=1.0, noise=2.0, seed=0, supersample=6, dark_firs
     width, height = size
     n = supersample
     x = (np.arange(width * n) + 0.5) / n - 0.5
-    y = (np.arange(height * n) + 0.5) / n - 0.5
-    u, v = np.meshgrid(x, y)
+    u, v = np.meshgrid(x, (np.arange(height * n) + 0.5) / n - 0.5)
     G = np.linalg.inv(H)
     w = G[2, 0] * u + G[2, 1] * v + G[2, 2]
     column, across = _stripes((G[0, 0] * u + G[0, 1] * v + G[0, 2]) / w, board.columns)

@@ -99,9 +99,8 @@ def violations(page: Any) -> list[str]:
     """What axe finds on the page as it stands: the rule, the element, and what is wrong, one line each."""
     from axe_playwright_python.sync_playwright import Axe
 
-    found = Axe().run(page).response["violations"]
     return [
         f"{rule['id']} ({rule['impact']}): {node['html'][:120]}: {' '.join(node['failureSummary'].split())[:200]}"
-        for rule in found
+        for rule in Axe().run(page).response["violations"]
         for node in rule["nodes"]
     ]

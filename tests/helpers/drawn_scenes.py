@@ -169,8 +169,7 @@ def bent() -> MeasuredBoard:
 
 def shifted() -> Figure:
     left = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480))
-    right = Camera.build(focal=(810, 800), center=(321, 240), size=(640, 480))
-    found = camera_difference(left, right)
+    found = camera_difference(left, Camera.build(focal=(810, 800), center=(321, 240), size=(640, 480)))
     return difference_figure(found, "june and december", difference_text(found))
 
 

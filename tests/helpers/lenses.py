@@ -82,5 +82,4 @@ def distort_with_jacobian(normalized: Tensor, lens: Tensor, model: str | LensMod
     model = LensModel.named(model)
     found = distort_components(normalized[..., 0], normalized[..., 1], lens, model, range(model.size))
     by_lens = found.coefficients.movedim(-1, -3).transpose(-1, -2)
-    by_point = torch.stack(found.point, -1).unflatten(-1, (2, 2))
-    return torch.stack([found.x, found.y], -1), by_point, by_lens
+    return torch.stack([found.x, found.y], -1), torch.stack(found.point, -1).unflatten(-1, (2, 2)), by_lens

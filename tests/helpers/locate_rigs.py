@@ -31,8 +31,7 @@ def turned(yaw_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Ten
     a, b, c = (math.radians(v) for v in (yaw_deg, pitch_deg, roll_deg))
     yaw = tensor([math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)])
     pitch = tensor([1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)])
-    roll = tensor([math.cos(c), -math.sin(c), 0], [math.sin(c), math.cos(c), 0], [0, 0, 1])
-    return yaw @ pitch @ roll
+    return yaw @ pitch @ tensor([math.cos(c), -math.sin(c), 0], [math.sin(c), math.cos(c), 0], [0, 0, 1])
 
 
 def real_rig() -> Rig:

@@ -34,8 +34,7 @@ def drawn_pixels(draw: torch.Generator, count: int) -> torch.Tensor:
     left = torch.rand(2 * count, 2, dtype=torch.float64, generator=draw) * (size - 1.0)
     ranges = 40.0 * 20.0 ** torch.rand(len(left), 1, dtype=torch.float64, generator=draw)
     right = rig(ranges * rig.left.unproject(left)[0])[0][:, 1]
-    seen = rig.right.inside(right)
-    return torch.stack([left, right], 1)[seen][:count]
+    return torch.stack([left, right], 1)[rig.right.inside(right)][:count]
 
 
 def pair(

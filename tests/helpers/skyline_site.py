@@ -31,8 +31,7 @@ class SmallSite(NamedTuple):
 
 def eye(east: float = 0.0, north: float = 0.0) -> NDArray[np.float64]:
     """(3,) meters of a camera on a mast of 12 m."""
-    ground = HILLS.ground(np.array([east]), np.array([north]))
-    return np.array([east, north, float(ground[0]) + 12.0])
+    return np.array([east, north, float(HILLS.ground(np.array([east]), np.array([north]))[0]) + 12.0])
 
 
 def camera() -> Camera:

@@ -143,8 +143,7 @@ def solve_dense(residual: Residual, start: Tensor, options: LMOptions | None = N
 def solve_schur(residual: Residual, start: Tensor, options: LMOptions | None = None) -> tuple[Tensor, Result]:
     """With the last parameter as the only local one."""
     shared = len(start) - 1
-    problem = OneView(residual, shared, len(start))
-    result = minimize(problem, (start[:shared], start[None, shared:]), options)
+    result = minimize(OneView(residual, shared, len(start)), (start[:shared], start[None, shared:]), options)
     return torch.cat([result.state[0], result.state[1][0]]), result
 
 

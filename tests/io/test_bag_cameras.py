@@ -13,16 +13,9 @@ from rosbags.interfaces import ConnectionExtRosbag1, QosDurability
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 
+from kcal import Camera, FileError, InputError, Rig, load_camera, load_rig, save_rig
 from kcal.bag import message_types
-from kcal.calibrate.camera.export import export_cameras
-from kcal.errors import FileError, InputError
-from kcal.io.camera_file import load_camera
-from kcal.io.formats import import_cameras
-from kcal.io.rig_file import load_rig, save_rig
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
+from kcal.lens import CameraCalibration, export_cameras, import_cameras, rotation_from_vector
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 K = [500.0, 0, 319.5, 0, 510.0, 239.5, 0, 0, 1]
@@ -134,8 +127,7 @@ def test_a_point_goes_through_tf_and_camera_info_to_the_pixels_of_both(tmp_path:
     in_right = (in_rig - center) @ back
     pixels, _ = known(torch.from_numpy(in_rig))
     for side, points, seen in (("left", in_left, pixels[:, 0]), ("right", in_right, pixels[:, 1])):
-        info = found[f"/{side}/camera_info"]
-        values = fields_of(info)
+        values = fields_of(found[f"/{side}/camera_info"])
         shown = cv2.projectPoints(points, np.zeros(3), np.zeros(3), values["k"].reshape(3, 3), values["d"])[0][:, 0]
         assert np.abs(shown - seen.numpy()).max() < 1e-9
     # Rectified, both see a point in one row; the baseline is in P of the right camera, in the left one's frame.
@@ -216,8 +208,7 @@ def test_a_rectified_pair_without_tf(tmp_path: Path) -> None:
         ("/left/camera_info", START, lambda s: info(s)),
         ("/right/camera_info", START, lambda s: info(s, values={"p": right})),
     ])  # fmt: skip
-    pair = import_cameras(bag).rig()
-    assert pair.right_from_left_translation.tolist() == [-0.25, 0, 0]
+    assert import_cameras(bag).rig().right_from_left_translation.tolist() == [-0.25, 0, 0]
 
 
 @pytest.mark.slow

@@ -17,10 +17,9 @@ import torch
 from command_line import Command
 from PIL import Image
 
-from kcal.errors import FileError
+from kcal import Camera, FileError
 from kcal.io.foreign_lenses import ForeignCamera
 from kcal.io.formats import import_cameras, recognized
-from kcal.lens.camera import Camera
 
 POINTS = np.array([[x, y, 1.0] for x in (-0.5, -0.1, 0.4) for y in (-0.3, 0.2)])
 FOURTEEN = [0.3, -0.06, -4e-5, 8e-5, -0.002, 0.65, -0.04, -0.01, 1e-3, -2e-4, 5e-4, 1e-4, 2e-3, -1e-3]
@@ -160,8 +159,7 @@ class TestAzureKinect:
         color, given = kinect("PV0", (4096, 2304))
         path = written(tmp_path, "calibration.json", {"CalibrationInformation": {"Cameras": [color]}})
         # The same rows of the sensor, of which 4:3 has 384 more above.
-        wanted = k4a(given, (4096, 2304), (0, -384))
-        assert off(seen(import_cameras(path).cameras[0]), wanted) < 1e-9
+        assert off(seen(import_cameras(path).cameras[0]), k4a(given, (4096, 2304), (0, -384))) < 1e-9
 
     def test_other_lenses_and_sizes_are_refused(self, tmp_path: Path) -> None:
         (old, _), (depth, _) = kinect("D0", (1024, 1024), "Rational6KT"), kinect("D0", (1024, 1024))
@@ -288,8 +286,7 @@ class TestZed:
         assert "--size 2208x1242" in every.notes[0]
         with pytest.raises(FileError, match=r"no camera of \(800, 600\)"):
             import_cameras(path, size=(800, 600))
-        said = command("import", path, "--size 1280x720 -o", tmp_path / "rig.json")
-        assert "baseline 0.1199 m" in said.out
+        assert "baseline 0.1199 m" in command("import", path, "--size 1280x720 -o", tmp_path / "rig.json").out
 
     def test_coefficients_for_all_resolutions(self, tmp_path: Path) -> None:
         eight = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), FOURTEEN, strict=False))

@@ -184,8 +184,7 @@ def test_an_omni_lens_is_never_another_silently(tmp_path: Path) -> None:
     matrix = np.array([[OMNI[1], 0, OMNI[3]], [0, OMNI[2], OMNI[4]], [0, 0, 1]])
     lens = {"camera_matrix": matrix, "distortion_coefficients": np.array(OMNI[5:]), "xi": OMNI[0]}
     other = file_storage(tmp_path / "o.yml", image_width=640, image_height=480, **lens)
-    draw = np.random.default_rng(1)
-    rays = np.concatenate([draw.uniform(-1.2, 1.2, (500, 2)), np.ones((500, 1))], 1)
+    rays = np.concatenate([np.random.default_rng(1).uniform(-1.2, 1.2, (500, 2)), np.ones((500, 1))], 1)
     omnidir = cv2.omnidir.projectPoints(rays[None], np.zeros(3), np.zeros(3), matrix, OMNI[0], np.array([OMNI[5:]]))[0]
     pixels = omnidir.reshape(-1, 2)
     for path in (write(tmp_path, "chain.yaml", chain), other):
@@ -291,8 +290,7 @@ def test_it_is_that_of_a_dense_problem(tmp_path: Path) -> None:
 
     def residuals(state: torch.Tensor) -> torch.Tensor:
         values, warp, frames = state[:8], state[8:10], state[10:].reshape(12, 6)
-        height = (warp[:, None, None] * modes).sum(0)
-        board = torch.cat([flat, height[..., None]], -1).reshape(-1, 3)
+        board = torch.cat([flat, (warp[:, None, None] * modes).sum(0)[..., None]], -1).reshape(-1, 3)
         seen = []
         for frame in frames:
             there = board @ rotation_from_vector(frame[:3]).T + frame[3:]

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from kcal import Camera
-from kcal.errors import FileError, InputError
+from kcal import Camera, FileError, InputError
 from kcal.io.foreign_lenses import ForeignCamera, fit_foreign, foreign_camera
 from kcal.lens import export_cameras, import_cameras
 from scripts.check.foreign_lenses import (
@@ -99,8 +98,7 @@ def test_a_lens_is_found_again(kind: str) -> None:
         def unproject(self, pixels: Any, *, start: Any = None) -> Any:
             return truth.unproject(torch.as_tensor(pixels))
 
-    stand_in = Shown(WIDE.params, size=SIZE, model=WIDE.model)
-    found = fit_foreign(kind, stand_in)
+    found = fit_foreign(kind, Shown(WIDE.params, size=SIZE, model=WIDE.model))
     assert float((found.project(rays)[0] - pixels).norm(dim=-1).max()) < 1e-3
 
 

@@ -48,8 +48,7 @@ def hostile_texts() -> Iterator[tuple[str, bytes]]:
         yield f"{digits} digits", json.dumps({"w": 1, "h": 1, "fl_x": 0}).replace("0", number).encode()
         yield f"{digits} digits in lines", f"name,lat,lon,height,sigma\na,{number},1,1,{number}\n".encode()
         place = {"properties": {"sigma": 1}, "geometry": {"type": "Point", "coordinates": [1, 2, 3]}}
-        text = json.dumps({"features": [place]}).replace("3", number)
-        yield f"{digits} digits in a place", text.encode()
+        yield f"{digits} digits in a place", json.dumps({"features": [place]}).replace("3", number).encode()
         yield f"{digits} digits of COLMAP", f"{number} PINHOLE {number} {number} 1 1 1 1\n".encode()
     yield "one long line", b"a" * 3_000_000
     sides = b"   rows: 2000000000\n   cols: 2000000000\n   dt: 2f\n   data: []\n"

@@ -100,8 +100,7 @@ def test_camera_file(side: str, tmp_path: Path) -> None:
     assert camera.calibration.record is not None
     assert camera.calibration.record.views == 20
     assert_same(content, json.loads(save_camera(camera, tmp_path / "again.json").read_text()))
-    renamed = save_camera(camera, tmp_path / "again.json", name="west")
-    assert CameraFile.load(renamed).name == "west"
+    assert CameraFile.load(save_camera(camera, tmp_path / "again.json", name="west")).name == "west"
 
 
 def test_files_with_little_in_them(tmp_path: Path) -> None:
@@ -143,8 +142,7 @@ def test_copies_and_pickles_keep_it() -> None:
 def test_it_does_not_outlive_the_parameters() -> None:
     rig = load_rig(SAMPLE)
     known = rig.left.calibration
-    moved = rig.left.with_parameters(rig.left.params + 1e-9)
-    assert moved.calibration is None
+    assert rig.left.with_parameters(rig.left.params + 1e-9).calibration is None
     with torch.no_grad():
         rig.left.params[0] += 1e-9
     assert rig.left.calibration is None

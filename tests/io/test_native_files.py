@@ -181,8 +181,7 @@ class TestCamera:
         polygon = torch.tensor(stored.polygon, dtype=torch.float64)
         # x - 0.3 x³ turns back at two thirds of 1 / √0.9, 281 px off axis: a circle cut by the image above and below.
         outward = polygon - camera.center
-        reach = torch.linalg.vector_norm(outward, dim=-1)
-        on_circle = (reach - 400 * 2 / 3 / math.sqrt(0.9)).abs() < 2e-3
+        on_circle = (torch.linalg.vector_norm(outward, dim=-1) - 400 * 2 / 3 / math.sqrt(0.9)).abs() < 2e-3
         on_border = (polygon[:, 1] + 0.5).abs().minimum((polygon[:, 1] - 479.5).abs()) < 1e-3
         assert bool((on_circle | on_border).all())
         assert int(on_circle.sum()) > 50
@@ -297,8 +296,7 @@ class TestRig:
     def test_wrong_field(self, tmp_path: Path, rig: Rig, path_in_file: list[Any], value: Any, message: str) -> None:
         rig = copy.deepcopy(rig)
         rig.calibration = rig_calibration()
-        content = rig_to_file(rig).dump()
-        assert_refused(load_rig, tmp_path, content, path_in_file, value, message)
+        assert_refused(load_rig, tmp_path, rig_to_file(rig).dump(), path_in_file, value, message)
 
     @pytest.mark.parametrize(
         ("path_in_file", "value", "message"),

@@ -78,13 +78,11 @@ def test_parameters_are_those_of_the_program(
     root = np.array(prior["sqrt_information"])
     assert np.array_equal(root, np.triu(root))
     assert bool((np.diag(root) > 0).all())
-    covariance = camera.calibration.covariance
-    wanted = covariance[chosen][:, chosen].numpy() * np.outer(scale, scale)
+    wanted = camera.calibration.covariance[chosen][:, chosen].numpy() * np.outer(scale, scale)
     spread = np.sqrt(np.diag(wanted))
     free = spread > 0
     unit = np.outer(spread[free], spread[free])
-    found = np.linalg.inv(root.T @ root)[free][:, free]
-    assert np.abs((found - wanted[free][:, free]) / unit).max() < 1e-7
+    assert np.abs((np.linalg.inv(root.T @ root)[free][:, free] - wanted[free][:, free]) / unit).max() < 1e-7
 
 
 def test_an_upright_image_is_counted_by_its_height() -> None:
@@ -101,8 +99,7 @@ def test_a_camera_comes_back(program: str, suffix: str, tmp_path: Path) -> None:
     model = "opencv4" if program == "colmap" else "opencv5"
     cameras = [known(model), known(model, (800, 600))]
     priors = [prior_of(program, cameras[0], (0.01, 0.25)), prior_of(program, cameras[1])]
-    path = write_priors(program, priors, tmp_path / f"a{suffix}")
-    found = read_prior(path, Hints())
+    found = read_prior(write_priors(program, priors, tmp_path / f"a{suffix}"), Hints())
     assert found.format == program
     assert found.notes == ("north: a fit to another lens, RMS 0.01 px",)
     for back, camera in zip(found.cameras, cameras, strict=True):
@@ -212,8 +209,7 @@ def test_read_back(camera: Camera, tmp_path: Path) -> None:
         assert torch.equal(getattr(new, name), getattr(old, name))
     torch.testing.assert_close(new.covariance(), old.covariance(), rtol=1e-9, atol=0)
     torch.testing.assert_close(new.rows.T @ new.residuals, old.rows.T @ old.residuals, rtol=1e-12, atol=1e-12)
-    second = save_camera(again, tmp_path / "second.json")
-    assert second.read_bytes() == first.read_bytes()
+    assert save_camera(again, tmp_path / "second.json").read_bytes() == first.read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -255,12 +251,11 @@ BOARD = Board(columns=9, rows=6, square=0.025)
 def awkward_board(scale: float = 1e-4) -> MeasuredBoard:
     generator = torch.Generator().manual_seed(5)
     amplitudes = scale * torch.randn(28, generator=generator, dtype=torch.float64)
-    half = 1e-6 * torch.randn(28, 28, generator=generator, dtype=torch.float64)
     return MeasuredBoard(
         name="π",
         board=BOARD,
         amplitudes=amplitudes,
-        half=half,
+        half=1e-6 * torch.randn(28, 28, generator=generator, dtype=torch.float64),
         log_evidence=1.0 / 3.0,
         observations=("left", "right"),
     )

@@ -50,8 +50,7 @@ def half(pixels: Pixels) -> Pixels:
 
 def ds(xi: float, alpha: float, k: Any = K) -> Pixels:
     def project(p: np.ndarray) -> np.ndarray:
-        first = np.linalg.norm(p, axis=1)
-        z = xi * first + p[:, 2]
+        z = xi * np.linalg.norm(p, axis=1) + p[:, 2]
         below = alpha * np.hypot(np.hypot(p[:, 0], p[:, 1]), z) + (1 - alpha) * z
         return p[:, :2] / below[:, None] * np.diag(k)[:2] + k[:2, 2]
 
@@ -714,8 +713,7 @@ IN_FIELD: dict[str, Pixels] = {
 @pytest.mark.skipif(not FIELD.is_dir(), reason="KCAL_DATA does not name the data")
 @pytest.mark.parametrize("name", IN_FIELD)
 def test_files_of_the_field(name: str) -> None:
-    camera = import_cameras(FIELD / name).cameras[0]
-    seen = camera.project(torch.from_numpy(WIDE))[0].numpy()
+    seen = import_cameras(FIELD / name).cameras[0].project(torch.from_numpy(WIDE))[0].numpy()
     assert np.abs(seen - IN_FIELD[name](WIDE)).max() < 1e-6
 
 

@@ -80,8 +80,7 @@ def rig(covariance: bool) -> Rig:
 
 def test_a_rig_at_a_glance() -> None:
     made = rig(True)
-    content = {"cameras": [{"x": 1}, {"x": 2}], "more": 3}
-    found = RigSummary.made(made, content)
+    found = RigSummary.made(made, {"cameras": [{"x": 1}, {"x": 2}], "more": 3})
     assert found.of == digest({"more": 3})
     left, right = found.cameras
     assert left is not None

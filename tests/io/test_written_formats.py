@@ -36,8 +36,7 @@ def test_a_spline_covers_the_wider_side() -> None:
         pixels = camera.grid(97, 73).reshape(-1, 2)
         rays, valid = camera.unproject(pixels)
         grid, values = fit_spline(rays[valid].numpy(), pixels[valid].numpy(), camera.size)
-        error = project_spline(grid, values, rays[valid].numpy()) - pixels[valid].numpy()
-        assert np.abs(error).max() < 0.05
+        assert np.abs(project_spline(grid, values, rays[valid].numpy()) - pixels[valid].numpy()).max() < 0.05
         grids.append((grid.fov_deg, grid.rows))
     assert grids[0] == grids[1]
 

@@ -69,8 +69,7 @@ def test_positions_are_those_of_the_camera_that_it_stands_for(kind: str) -> None
     many = Rig([make(), camera, make()], ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), center=4.0 * torch.eye(3))
     seen, visible = many(POINTS)
     assert bool(visible.all())
-    located = Localizer(many, pixel_sigma=0.1)(seen)
-    torch.testing.assert_close(located.enu, POINTS, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(Localizer(many, pixel_sigma=0.1)(seen).enu, POINTS, rtol=1e-4, atol=1e-4)
 
 
 def test_gradients_reach_the_weights_of_a_users_camera() -> None:

@@ -176,8 +176,7 @@ class TestBatches:
     def test_one_point_set_a_camera(self) -> None:
         vectors = torch.stack([parameters("opencv5", scale * strong("opencv5")) for scale in (0.0, 1.0)])
         batch = Camera(vectors, size=(4, 3))
-        points = torch.stack([POINTS, POINTS.flip(0)])
-        pixels, valid = batch.project(points)
+        pixels, valid = batch.project(torch.stack([POINTS, POINTS.flip(0)]))
         assert valid.tolist() == [[True] * 3] * 2
         torch.testing.assert_close(
             pixels[1], Camera(vectors[1], size=(4, 3)).project(POINTS.flip(0))[0], rtol=0, atol=1e-14

@@ -26,8 +26,7 @@ MODELS = ["opencv4", "opencv5", "opencv8", "opencv12", "opencv14", "ext16", "ext
 
 def of_model(model: str) -> ExtendedDistortion:
     """With every coefficient different from zero."""
-    names = PRESETS[model].names
-    return ExtendedDistortion([LENS.get(name, 1e-3) for name in names], model)
+    return ExtendedDistortion([LENS.get(name, 1e-3) for name in PRESETS[model].names], model)
 
 
 def points(count: int = 40, reach: float = 0.6) -> Tensor:
@@ -41,8 +40,7 @@ def test_it_is_the_distortion_of_opencv_and_kornia(model: str) -> None:
     found, valid = distortion(here)
     assert bool(valid.all())
     rays = np.concatenate([here.numpy(), np.ones((len(here), 1))], 1)
-    coefficients = distortion.coefficients.numpy()
-    wanted, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), coefficients)
+    wanted, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), distortion.coefficients.numpy())
     np.testing.assert_allclose(found, wanted[:, 0], rtol=0, atol=1e-14)
     theirs = distort_points(here[None], torch.eye(3)[None].double(), distortion.coefficients[None])[0]
     torch.testing.assert_close(found, theirs, rtol=0, atol=1e-14)
@@ -206,8 +204,7 @@ TIMES = torch.linspace(-HALF, HALF, 21, dtype=torch.float64)
 def test_size_is_the_largest_value_and_slope() -> None:
     for one in (FIRST, SECOND):
         value, slope = (float(part) for part in one.size())
-        steepest = max(abs(b + c * t) for _, b, c in members(one) for t in (-HALF, HALF))
-        assert slope == pytest.approx(steepest)
+        assert slope == pytest.approx(max(abs(b + c * t) for _, b, c in members(one) for t in (-HALF, HALF)))
         largest = max(float((a + b * TIMES + 0.5 * c * TIMES**2).abs().max()) for a, b, c in members(one))
         assert largest <= value <= largest + 0.5 * float(one.bend) * HALF**2 + 1e-12
 

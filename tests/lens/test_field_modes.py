@@ -62,8 +62,7 @@ def test_the_field_is_the_sum_of_its_columns(kind: str) -> None:
     assert len(plain) == 2
     torch.testing.assert_close(torch.stack(plain), wanted, rtol=1e-12, atol=1e-13)
     # One vector of weights for all views.
-    again = modes.field(weights[0], x, y)
-    torch.testing.assert_close(again[0][0], found[0][0], rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(modes.field(weights[0], x, y)[0][0], found[0][0], rtol=1e-12, atol=1e-13)
 
 
 @every
@@ -146,10 +145,9 @@ def test_files(kind: str, tmp_path: Path) -> None:
     content = json.loads(path.read_text())
     hybrid = content["model"]["hybrid"]
     assert set(hybrid) == {"shape", "radius", kind}
-    zernike = {"radial": 1, "decentered": 0, "astigmatic": 0, "other": 0}
     for change, complaint in (
         ({kind: None}, "one kind.*got none"),
-        ({"modes": zernike}, f"got modes and {kind}"),
+        ({"modes": {"radial": 1, "decentered": 0, "astigmatic": 0, "other": 0}}, f"got modes and {kind}"),
         ({kind: {"widths": [0.5, 1.0]} if kind == "gaussian" else {"hidden": [[0, 0, 1]]}}, "widths must|each must"),
     ):
         assert_refused(load_camera, tmp_path, content, ["model", "hybrid"], {**hybrid, **change}, complaint)
@@ -286,8 +284,7 @@ def test_inputs_and_weights_are_not_overwritten() -> None:
     weights = torch.randn(len(FEW), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     kept = x.clone(), y.clone(), weights.clone()
     first = FEW.field(weights, x, y)
-    second = FEW.field(weights, x, y)
-    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(first, FEW.field(weights, x, y), strict=True))
     assert all(torch.equal(a, b) for a, b in zip(kept, (x, y, weights), strict=True))
 
 
@@ -360,8 +357,7 @@ class TestRotation:
     def test_derivative_is_finite_and_right(self, length: float) -> None:
         w = length * axis(4)
         derivative = torch.func.jacfwd(rotation_from_vector)(w)
-        reverse = torch.func.jacrev(rotation_from_vector)(w)
-        torch.testing.assert_close(derivative, reverse, rtol=0, atol=1e-12)
+        torch.testing.assert_close(derivative, torch.func.jacrev(rotation_from_vector)(w), rtol=0, atol=1e-12)
         # Fourth-order differences leave rounding over the step.
         wanted = numeric(lambda v: torch.linalg.matrix_exp(cross(v)), w, 1e-4)
         torch.testing.assert_close(derivative, wanted, rtol=0, atol=1e-10)
@@ -386,8 +382,7 @@ class TestNearestRotation:
     @settings(max_examples=40, deadline=None)
     @given(seed=st.integers(0, 10_000), size=st.floats(1e-9, 0.3))
     def test_no_other_rotation_is_nearer(self, seed: int, size: float) -> None:
-        generator = torch.Generator().manual_seed(seed)
-        noise = torch.randn(3, 3, generator=generator, dtype=torch.float64)
+        noise = torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
         m = rotation_from_vector(2.0 * axis(seed)) + size * noise
         r = nearest_rotation(m)
         assert float(torch.linalg.det(r)) == pytest.approx(1.0, abs=1e-12)

@@ -91,8 +91,7 @@ class TestOtherTerms:
 
     def test_behind_the_end_of_a_fold(self) -> None:
         """Where a fold ends in the plane, points behind it are cut out, and points beside it stay."""
-        lens = torch.tensor(BENT, dtype=torch.float64)
-        region = valid_region(lens, "opencv14")
+        region = valid_region(torch.tensor(BENT, dtype=torch.float64), "opencv14")
         assert region.cuts.shape == (2, 4)
         for cut in region.cuts:
             angle, half = torch.atan2(cut[1], cut[0]), torch.acos(cut[2])
@@ -127,8 +126,7 @@ class TestOtherTerms:
 
     def test_several_lenses_are_judged_each_on_its_own(self) -> None:
         lenses = torch.stack([strong("opencv14"), torch.tensor(BENT, dtype=torch.float64), torch.zeros(14).double()])
-        together = valid_region(lenses, "opencv14")
-        for lens, *own in zip(lenses, *together, strict=True):
+        for lens, *own in zip(lenses, *valid_region(lenses, "opencv14"), strict=True):
             alone = valid_region(lens, "opencv14")
             assert torch.equal(alone.radius, own[0])
             assert torch.equal(alone.edge, own[1])

@@ -133,8 +133,7 @@ def test_what_is_set_on_a_rig_elsewhere_is_not_set_on_the_first_one() -> None:
     one = rig(free=False)
     lens, pose, columns = one.left, one.right_from_left_translation.clone(), one.quantities
     other = one.placed(origin=Origin(lat=0.0, lon=0.0, height=0.0), heading_deg=0.0)
-    localize = Localizer(one, root=torch.zeros(1, columns, dtype=torch.float64))
-    for copied in (other, localize.rig):
+    for copied in (other, Localizer(one, root=torch.zeros(1, columns, dtype=torch.float64)).rig):
         copied.left = Camera.build(focal=(9, 9), center=(1, 1), size=lens.size, model="pinhole")
         copied.free("right")
         copied.pose_step.data += 1.0

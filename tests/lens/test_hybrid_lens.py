@@ -94,8 +94,7 @@ class TestBaseMap:
         """What the projection cannot reach is no part of the lens, however large its disc is."""
         for shape in (1.0, 0.3, 0.0, -0.4):
             limit = largest_base_radius(shape)
-            form = HybridForm(shape=shape, radius=1e3, modes=SMALL)
-            assert form.reach == limit
+            assert HybridForm(shape=shape, radius=1e3, modes=SMALL).reach == limit
             camera = plain(shape, 1e3)
             rays = directions(torch.linspace(0.01, 3.14, 400).double(), 2)
             pixels, valid = camera.project(rays)
@@ -187,8 +186,7 @@ class TestDerivatives:
         camera = hybrid_camera(kind, modes=FEW_MODES)
         rays, _ = camera.unproject(camera.grid(5, 4).flatten(0, 1))
         points = torch.cat([rays * 0.8, torch.tensor([[0.0, 0.0, 1.2], [1e-12, -1e-12, 1.0]]).double()])
-        wanted = range(len(camera.names))
-        analytic = project_components(points.T, camera.params, camera.model, wanted)
+        analytic = project_components(points.T, camera.params, camera.model, range(len(camera.names)))
         assert bool(analytic.regular.all())
 
         def pixels(points: Tensor, values: Tensor) -> Tensor:
@@ -270,8 +268,7 @@ class TestRoundTrip:
         assert bool(seen.all())
         torch.testing.assert_close(again, pixels, rtol=0, atol=1e-9)
         # The other way round.
-        points = camera.ray_origins(rays) + 0.7 * rays
-        back, found = camera.unproject(camera.project(points)[0])
+        back, found = camera.unproject(camera.project(camera.ray_origins(rays) + 0.7 * rays)[0])
         assert bool(found.all())
         torch.testing.assert_close(back, rays, rtol=0, atol=1e-12)
 
@@ -365,17 +362,15 @@ COUNT = PIECE + 1000
 
 def random_pixels(camera: Camera, count: int = COUNT, beyond: float = 0.0) -> Tensor:
     """Pixels all over the image, and as far beyond it as `beyond` of its size."""
-    generator = torch.Generator().manual_seed(5)
-    share = torch.rand(count, 2, generator=generator, dtype=torch.float64)
+    share = torch.rand(count, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     return ((1.0 + 2.0 * beyond) * share - beyond) * torch.tensor(camera.size) - 0.5
 
 
 def random_points(camera: Camera, nearest: float = 0.8, count: int = COUNT) -> Tensor:
     """Points seen all over the image, from `nearest` meters to some hundred."""
     rays, _ = camera._unproject_by_formulas(random_pixels(camera, count))
-    generator = torch.Generator().manual_seed(6)
     return camera.ray_origins(rays) + rays * nearest * torch.exp(
-        6.0 * torch.rand(count, 1, generator=generator, dtype=torch.float64)
+        6.0 * torch.rand(count, 1, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
     )
 
 
@@ -548,8 +543,7 @@ class TestPolynomials:
         assert len(trim(series, 2.0)) == 0
         t = np.linspace(-1, 1, 999)
         whole = np.polynomial.chebyshev.chebval(t, series)
-        short = np.polynomial.chebyshev.chebval(t, trim(series, 6.5e-6))
-        assert float(np.abs(whole - short).max()) < 6.5e-6
+        assert float(np.abs(whole - np.polynomial.chebyshev.chebval(t, trim(series, 6.5e-6))).max()) < 6.5e-6
 
     def test_several_at_once(self) -> None:
         series = [np.array([0.3]), np.array([]), np.array([1.0, 2.0, -0.5, 0.25]), np.array([0.0, 1.0])]
@@ -568,8 +562,7 @@ class TestPolynomials:
             w = w + (0.02 + 0.03j) * z**5 * s + 0.01 * z.conj() ** 4 - 0.04j * z.conj() * s**2
             return w.real, w.imag
 
-        degrees = {1: 9, 0: 6, 2: 6, 5: 7, -4: 6, -1: 7, 3: 5}
-        fitted = fit_plane_map(exact, degrees, 1e-13)
+        fitted = fit_plane_map(exact, {1: 9, 0: 6, 2: 6, 5: 7, -4: 6, -1: 7, 3: 5}, 1e-13)
         assert fitted.matrix.shape == (16, 8)
         x, y = 0.7 * (2.0 * torch.rand(2, 500, generator=torch.Generator().manual_seed(9), dtype=torch.float64) - 1.0)
         u, v, square = fitted(x, y, torch.empty(fitted.rows, 500, dtype=torch.float64))

@@ -273,5 +273,4 @@ def test_a_place_of_the_edge_without_an_image_opens_no_way_beyond() -> None:
     at = angle[300] + torch.tensor([0.0, 0.002, 0.004], dtype=torch.float64)
     for reach in (1.9, 2.5):
         x, y = reach * torch.stack([at.cos(), at.sin()])
-        fraction = _edge_fraction(x[None], y[None], edge[:1], edge[1:])
-        assert bool((fraction > 1.0001).all()) == (reach > 2.2)
+        assert bool((_edge_fraction(x[None], y[None], edge[:1], edge[1:]) > 1.0001).all()) == (reach > 2.2)

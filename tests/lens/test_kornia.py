@@ -67,8 +67,7 @@ def test_pinholes_in_batches_and_with_skew(count: int) -> None:
     pixels, _ = camera.project(points)
     assert torch.allclose(there.project(points), pixels, rtol=0, atol=1e-9)
     assert torch.allclose(there.unproject(pixels, points[..., 2:]), points, rtol=0, atol=1e-12)
-    again = Camera.from_kornia(there)
-    assert torch.equal(again.params, values if count > 1 else values[0])
+    assert torch.equal(Camera.from_kornia(there).params, values if count > 1 else values[0])
 
 
 @pytest.mark.parametrize(
@@ -117,8 +116,7 @@ def test_a_pinhole_rig_in_the_epipolar_functions() -> None:
     rig = rig_with([])
     points = POINTS * 5
     left, right = rig(points)[0].unbind(-2)
-    distance = epi.sampson_epipolar_distance(left[None], right[None], rig.fundamental[None])
-    assert float(distance.max()) < 1e-18
+    assert float(epi.sampson_epipolar_distance(left[None], right[None], rig.fundamental[None]).max()) < 1e-18
     wrong = epi.sampson_epipolar_distance(left[None], right[None] + torch.tensor([0.0, 1.0]), rig.fundamental[None])
     assert float(wrong.min()) > 0.1
     found = epi.find_fundamental(left[None].repeat(1, 2, 1), right[None].repeat(1, 2, 1), torch.ones(1, 8).double())
@@ -150,8 +148,7 @@ def test_a_posed_rig_goes_to_kornia_and_comes_back() -> None:
     rig = rig_with([])
     left, right = rig.to_kornia()
     points = POINTS * 5
-    seen = rig(points)
-    for camera, pixels in zip((left, right), seen[0].unbind(-2), strict=True):
+    for camera, pixels in zip((left, right), rig(points)[0].unbind(-2), strict=True):
         assert torch.allclose(camera.project(points[None])[0], pixels, rtol=0, atol=1e-9)
     # The frame may stand anywhere.
     moved = torch.eye(4).double()
@@ -177,8 +174,7 @@ def test_transforms_of_augmentations_are_those_of_their_pixels(augment: torch.nn
     """A ramp of columns and one of rows: the value at an input pixel is where it lies in the full image."""
     torch.manual_seed(3)
     x, y = torch.meshgrid(torch.arange(160.0), torch.arange(120.0), indexing="xy")
-    ramps = torch.stack([x, y])[None].repeat(2, 1, 1, 1)
-    seen = augment(ramps)
+    seen = augment(torch.stack([x, y])[None].repeat(2, 1, 1, 1))
     size = seen.shape[3], seen.shape[2]
     transforms = ImageTransform.from_matrices(augment.transform_matrix, (160, 120), size)  # type: ignore[arg-type]
     pixels = torch.tensor([[40.0, 30.0], [61.0, 52.0], [70.0, 44.0]])

@@ -85,8 +85,7 @@ def check_bounds(camera: Camera, lookup: LookupCamera) -> None:
     assert float(torch.linalg.vector_norm(found - pixels, dim=-1)[valid].max()) <= lookup.bound[0]
 
     # Points anywhere: beside the image, beyond the fold, behind the camera.
-    generator = torch.Generator().manual_seed(3)
-    points = torch.randn(20000, 3, generator=generator, dtype=torch.float64)
+    points = torch.randn(20000, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     found, valid = lookup.project(points)
     wanted, seen = camera.project_rays(points)
     # Within the bound of the image's edge the two may differ about what is in the image.
@@ -395,8 +394,7 @@ class TestSpline:
             known[:rings], known[:, len(known[0]) - rings :] = False, False
             values, filled = extend_nodes(cubic(*grid), known)
             assert bool(filled.all())
-            spline = Spline(filter_nodes(values), low - step, step, cells)
-            found, valid = evaluate_spline(spline, x, y)
+            found, valid = evaluate_spline(Spline(filter_nodes(values), low - step, step, cells), x, y)
             assert bool(valid.all())
             torch.testing.assert_close(found, cubic(x, y), rtol=0, atol=1e-12)
 

@@ -251,8 +251,7 @@ def test_files(kind: str, tmp_path: Path) -> None:
     rig = Rig.pair(own, own, torch.eye(3), torch.tensor([-1.0, 0.0, 0.0]))
     assert load_rig(save_rig(rig, tmp_path / "rig.json"), field=field).fingerprint == rig.fingerprint
     many = Rig([own] * 3, ["a", "b", "c"], torch.eye(3).repeat(3, 1, 1), center=torch.eye(3))
-    saved = save_rig(many, tmp_path / "many.json")
-    assert RigFile.load(saved).rig(field).fingerprint == many.fingerprint
+    assert RigFile.load(save_rig(many, tmp_path / "many.json")).rig(field).fingerprint == many.fingerprint
     if kind != "chain":
         with pytest.raises(
             InputError, match=rf"{type(network(kind)).__name__}, which is not kcal's and no command can load"
@@ -279,8 +278,7 @@ def test_weights_of_another_training_are_refused(tmp_path: Path) -> None:
     with torch.no_grad():
         other.get_parameter("field.gate").mul_(2.0)
     changed = json.loads(save_camera(other, tmp_path / "other.json").read_text())
-    network_record = content["model"]["hybrid"]["network"]
-    network_record["weights"] = changed["model"]["hybrid"]["network"]["weights"]
+    content["model"]["hybrid"]["network"]["weights"] = changed["model"]["hybrid"]["network"]["weights"]
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match="digest"):
         load_camera(path, field=Waves())

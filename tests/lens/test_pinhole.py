@@ -211,8 +211,7 @@ def test_second_derivatives_of_the_inverse(model: str | LensModel) -> None:
 def test_inverse_has_the_inverse_jacobian(model: str | LensModel) -> None:
     """The implicit function theorem, written out: dx/dx_D = J⁻¹ and dx/dc = -J⁻¹ ∂x_D/∂c."""
     lens = strong(model)
-    normalized = POINTS[:, :2] / POINTS[:, 2:]
-    distorted, by_point, by_coefficients = distort_with_jacobian(normalized, lens, model)
+    distorted, by_point, by_coefficients = distort_with_jacobian(POINTS[:, :2] / POINTS[:, 2:], lens, model)
     inverse = torch.linalg.inv(by_point)
     for n in range(len(POINTS)):
 

@@ -87,8 +87,7 @@ def test_projection_sigma_near_and_far(at: float) -> None:
         return
     moved = known.params.detach().clone()
     moved[pupil] += 1e-3
-    points = known.ray_origins(rays) + at * rays
-    there, _ = known.with_parameters(moved).project(points)
+    there, _ = known.with_parameters(moved).project(known.ray_origins(rays) + at * rays)
     torch.testing.assert_close(found, (there - pixels).norm(dim=-1), rtol=0.02 / at, atol=1e-4)
 
 

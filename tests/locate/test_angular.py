@@ -64,8 +64,7 @@ def test_two_rays_are_turned_as_little_as_possible() -> None:
 
     def cost(points: torch.Tensor) -> torch.Tensor:
         seen = torch.stack([points, points @ pose[0].T + pose[1]], -2)
-        cosine = torch.nn.functional.cosine_similarity(seen, rays, dim=-1)
-        return (1.0 - cosine**2).sum(-1)
+        return (1.0 - torch.nn.functional.cosine_similarity(seen, rays, dim=-1) ** 2).sum(-1)
 
     best = cost(points)
     for axis in torch.eye(3, dtype=torch.float64):

@@ -31,8 +31,7 @@ class TestDisparities:
         there = points @ rectify.rotation
         pixels, _ = rectify.camera.project(there)
         disparity = rectify.camera.focal[0].detach() * rig.baseline / there[:, 2]
-        ranges = DisparityRanges(rectify, disparity_sigma=0.4)
-        found = ranges.at(pixels, disparity)
+        found = DisparityRanges(rectify, disparity_sigma=0.4).at(pixels, disparity)
         assert bool(found.valid.all())
         far = points.norm(dim=-1)
         torch.testing.assert_close(found.range, far, rtol=1e-6, atol=0)
@@ -45,8 +44,7 @@ class TestDisparities:
 
     def test_what_has_no_range(self) -> None:
         ranges = DisparityRanges(StereoRectification(RIG))
-        pixels = tensor([960.0, 540.0]).expand(5, 2)
-        found = ranges.at(pixels, tensor(16.0, 0.0, -1.0, math.nan, math.inf))
+        found = ranges.at(tensor([960.0, 540.0]).expand(5, 2), tensor(16.0, 0.0, -1.0, math.nan, math.inf))
         assert found.valid.tolist() == [True, False, False, False, False]
         assert bool(found.range[1:].isinf().all())
         assert bool(found.sigma[1:].isinf().all())
@@ -96,8 +94,7 @@ def test_errors_against_a_truth() -> None:
     left[2] = math.nan
     located = located_pairs(RIG, left, right, origin=ORIGIN, heading_deg=0.0, **STRAIGHT)
     # The second is said to be 3 m to the east, 4 m to the south and 200 m farther than it is.
-    wrong = tensor([0.0, 500.0, 0.0], [6.0, 604.0, 0.0], [0.0, 900.0, 0.0])
-    found = position_errors(located, wrong)
+    found = position_errors(located, tensor([0.0, 500.0, 0.0], [6.0, 604.0, 0.0], [0.0, 900.0, 0.0]))
     assert found[0] == pytest.approx((0.0, 0.0, True), abs=1e-6)
     assert found[1] is not None
     across, along, inside = found[1]
@@ -107,8 +104,7 @@ def test_errors_against_a_truth() -> None:
     assert found[2] is None
     assert position_errors(located, tensor([math.nan, 0, 0], [0, 0, 0], [0, 0, 0]))[0] is None
     localize = Localizer(RIG.placed(origin=ORIGIN, heading_deg=0.0, **STRAIGHT))
-    true = points.norm(dim=-1)
-    assert interval_coverage(localize, left[:2], right[:2], true[:2]) == 1.0
+    assert interval_coverage(localize, left[:2], right[:2], points.norm(dim=-1)[:2]) == 1.0
     assert interval_coverage(localize, left[:2], right[:2], tensor(500.0, 1200.0)) == 0.5
     assert interval_coverage(localize, left[:2], right[:2], tensor(400.0, 300.0)) == 0.0
 
@@ -116,8 +112,7 @@ def test_errors_against_a_truth() -> None:
 @pytest.mark.parametrize("suffix", APPENDED)
 def test_rows_of_a_file_that_grows(suffix: str) -> None:
     """What begins the file stands before the first rows only; each thing has rows of its own."""
-    points = tensor([0.0, 0.0, 500.0], [9.0, 0.0, 800.0])
-    left, right = RIG(points)[0].unbind(-2)
+    left, right = RIG(tensor([0.0, 0.0, 500.0], [9.0, 0.0, 800.0]))[0].unbind(-2)
     run = located_pairs(RIG, left, right, origin=ORIGIN, heading_deg=0.0, names=["mast", "mill"], **STRAIGHT)
     time = datetime.datetime(2026, 1, 2, 3, 4, 5, tzinfo=datetime.UTC)
     first, later = (appended(suffix, run, run.columns, time, first=one).decode() for one in (True, False))
@@ -138,8 +133,7 @@ def test_rows_of_a_file_that_grows(suffix: str) -> None:
 def test_the_direction_that_no_point_explains() -> None:
     """Of four pixel coordinates: of length one, across the derivatives by the point, so along the epipolar error."""
     rig = real_rig()
-    points = spread_points(torch.tensor([80.0, 300.0, 2000.0], dtype=torch.float64))
-    left, right = rig(points)[0].unbind(-2)
+    left, right = rig(spread_points(torch.tensor([80.0, 300.0, 2000.0], dtype=torch.float64)))[0].unbind(-2)
     found = fit_pairs(rig, left, right)
     assert found.status.tolist() == [PositionStatus.OK] * 3
     # What the gain does not reach: its null space.

@@ -46,8 +46,7 @@ def test_a_doubled_key_is_found_wherever_it_is(
     draw = random.Random(count)
     for _ in range(5):
         first, again = sorted(draw.sample(range(count + 1), 2))
-        with_double = [*keys[:again], keys[first], *keys[again:]]
-        assert found(with_double, step) == (keys[first], 2 + first, 2 + again)
+        assert found([*keys[:again], keys[first], *keys[again:]], step) == (keys[first], 2 + first, 2 + again)
 
 
 def test_a_table_that_is_longer_than_memory(tmp_path: Path) -> None:
@@ -84,8 +83,7 @@ def test_nothing_is_written_of_a_refused_table(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr("kcal.locate.marks.read_chunks", lambda *given, **more: whole(*given, **more | {"at_once": 5}))
     words = ["locate", str(tmp_path / "rig.json"), str(tmp_path / "marks.csv"), "-o", str(tmp_path / "out.csv")]
     words += ["--site", "0,0,0", "--heading", "0"]
-    done = CliRunner().invoke(app, words)
-    assert "line 42: the name 'a0' was used on line 2" in str(done.exception)
+    assert "line 42: the name 'a0' was used on line 2" in str(CliRunner().invoke(app, words).exception)
     assert not (tmp_path / "out.csv").exists()
 
 

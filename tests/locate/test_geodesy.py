@@ -208,8 +208,7 @@ def test_the_arc_tangent_of_exported_graphs_is_the_same(monkeypatch: pytest.Monk
     y, x = (torch.cat([a.flatten(), torch.tensor(b).double()]) for a, b in ((y, [0, 1, -1, 0]), (x, [-1, 0, 0, 2])))
     wanted = torch.atan2(y, x)
     monkeypatch.setattr(torch.compiler, "is_exporting", lambda: True)
-    found = arc_tangent(y, x)
-    assert torch.allclose(found, wanted, rtol=1e-15, atol=1e-300)
+    assert torch.allclose(arc_tangent(y, x), wanted, rtol=1e-15, atol=1e-300)
 
 
 class Places(torch.nn.Module):
@@ -247,8 +246,7 @@ def test_no_grid_and_bad_grids(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(pyproj.datadir, "get_data_dir", lambda: str(tmp_path))
     monkeypatch.setattr(pyproj.datadir, "get_user_data_dir", lambda *_: str(tmp_path / "none"))
     assert find_geoid() is None
-    found = grid(tmp_path / "egm96_15.gtx")
-    assert find_geoid() == (found, "egm96_15")
+    assert find_geoid() == (grid(tmp_path / "egm96_15.gtx"), "egm96_15")
     (tmp_path / "bad.gtx").write_bytes(b"no grid")
     with pytest.raises(FileError, match="cannot read this geoid grid"):
         geoid_column(find_geoid(tmp_path / "bad.gtx"), np.array([19.0]), np.array([73.0]))

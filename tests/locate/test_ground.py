@@ -65,8 +65,7 @@ def test_refraction_counts_the_level_distance() -> None:
     steep = {"origin": high, "heading_deg": 0.0, "pitch_deg": -60.0, "roll_deg": 0.0}
     mark = torch.tensor([[960.0, 540.0]], dtype=torch.float64)
     straight, bent = (on_ground(stands(**steep, refraction=k), mark, level_ground(0.0), 0.1).enu[0] for k in (0.0, 0.5))
-    level = float(straight[1])
-    lower = 0.5 * level**2 / 2 / 6.35e6
+    lower = 0.5 * float(straight[1]) ** 2 / 2 / 6.35e6
     # It falls by tan 60° for each meter forward, and the ground by 0.0005.
     assert float(straight[1] - bent[1]) == pytest.approx(lower / math.tan(math.radians(60.0)), rel=0.01)
 
@@ -76,8 +75,7 @@ def test_errors_are_as_large_as_stated() -> None:
     known = mounting_covariance(origin_m=(0.5, 0.5, 0.3), attitude_deg=(0.01, 0.01, 0.02))
     true = geodetic_to_enu(torch.tensor([[19.076, 72.874, 12.0]], dtype=torch.float64), ORIGIN)
     mounting = stands(covariance=torch.block_diag(known, torch.zeros(1, 1).double()))
-    pixel = pixels_of(mounting, true)
-    stated = on_ground(mounting, pixel, level_ground(12.0), 0.5, 0.4)
+    stated = on_ground(mounting, pixels_of(mounting, true), level_ground(12.0), 0.5, 0.4)
     marks, places = [], []
     for _ in range(400):
         error = known.diagonal().sqrt() * torch.randn(6, generator=generator).double()
@@ -96,8 +94,7 @@ def test_errors_are_as_large_as_stated() -> None:
     ratio = torch.linalg.eigvals(torch.linalg.solve(stated.covariance[0, :2, :2], spread)).real
     assert float(ratio.min()) > 0.8
     assert float(ratio.max()) < 1.25
-    span = float(torch.linalg.vector_norm(true))
-    assert float(stated.range_low) < span < float(stated.range_high)
+    assert float(stated.range_low) < float(torch.linalg.vector_norm(true)) < float(stated.range_high)
 
 
 def raster_file(folder: Path) -> Path:
@@ -263,8 +260,7 @@ def test_scale_offset_and_unit_of_a_raster(
 
 
 def test_heights_in_no_unit_of_length_are_refused(tmp_path: Path) -> None:
-    rasterio = pytest.importorskip("rasterio")
-    with rasterio.open(raster_file(tmp_path), "r+") as file:
+    with pytest.importorskip("rasterio").open(raster_file(tmp_path), "r+") as file:
         file.units = ("kelvin",)
     with pytest.raises(FileError, match="in 'kelvin', which is no known unit of length"):
         terrain(tmp_path / "terrain.tif")

@@ -37,8 +37,7 @@ def test_exact_rays_give_the_point_back(baseline: float) -> None:
 
 def test_agrees_with_equation_9_as_printed() -> None:
     points, cameras = world_points(8), stereo()
-    rays = rays_to(points, cameras)
-    for point, pair in zip(points, rays, strict=True):
+    for point, pair in zip(points, rays_to(points, cameras), strict=True):
         rows = []
         for (x, y, z), P in zip(pair.tolist(), cameras, strict=True):
             rows += [x / z * P[2] - P[0], y / z * P[2] - P[1]]

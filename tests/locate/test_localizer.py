@@ -269,8 +269,7 @@ def test_gradients_of_everything() -> None:
 
 
 def test_batches_pieces_and_precision() -> None:
-    points = spread_points(torch.linspace(50, 3000, 40_000, dtype=torch.float64))
-    left, right = RIG(points)[0].unbind(-2)
+    left, right = RIG(spread_points(torch.linspace(50, 3000, 40_000, dtype=torch.float64)))[0].unbind(-2)
     module = localizer()
     flat = module(left, right)
     deep = module(left[:24].reshape(2, 3, 4, 2), right[:24].reshape(2, 3, 4, 2))

@@ -367,5 +367,4 @@ def test_one_stream(folder: Path, command: Command) -> None:
 def test_a_summary_for_programs(folder: Path, command: Command) -> None:
     summary = json.loads(command(LOCATE, "--json -o out.csv").out)
     assert (summary["rows"], summary["wrote"]) == (ROWS, ["out.csv"])
-    rows = rows_of(folder / "out.csv")
-    assert summary["statuses"]["ok"] == sum(row["status"] == "ok" for row in rows)
+    assert summary["statuses"]["ok"] == sum(row["status"] == "ok" for row in rows_of(folder / "out.csv"))

@@ -37,8 +37,7 @@ def test_the_typical_sigma_is_the_median_of_the_marks_that_are_there() -> None:
     assert marks(vague).typical_sigma(0.3) == 0.3
     assert marks(stated()).typical_sigma(0.1) == pytest.approx(0.1)
     assert marks(stated()).typical_sigma(0.01) == pytest.approx(0.01)
-    nothing = Marks.of_pair(("a",), torch.tensor([NONE]), torch.tensor([NONE]), None)
-    assert nothing.typical_sigma(0.3) == 0.3
+    assert Marks.of_pair(("a",), torch.tensor([NONE]), torch.tensor([NONE]), None).typical_sigma(0.3) == 0.3
 
 
 def test_covariances_are_filled_pair_by_pair() -> None:

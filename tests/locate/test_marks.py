@@ -84,8 +84,7 @@ class TestCovariance:
         assert again.names == marks.names
         assert again.covariance is not None
         torch.testing.assert_close(again.covariance, covariance, equal_nan=True, atol=0, rtol=0)
-        filled = again.covariance_or(0.5)
-        assert torch.equal(filled[1], 0.25 * torch.eye(4).double())
+        assert torch.equal(again.covariance_or(0.5)[1], 0.25 * torch.eye(4).double())
 
     @pytest.mark.parametrize(
         ("cells", "message"),

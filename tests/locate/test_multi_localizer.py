@@ -107,8 +107,7 @@ def test_a_wrong_view_is_named_and_left_out(count: int) -> None:
     points = targets(40)
     pixels = marks(rig, points) + noise((40, count, 2), 0.3)
     wrong = torch.arange(40) % count
-    off = torch.tensor([[120.0, 90.0], [-20.0, 30.0]])[torch.arange(40) % 2]
-    pixels[torch.arange(40), wrong] += off
+    pixels[torch.arange(40), wrong] += torch.tensor([[120.0, 90.0], [-20.0, 30.0]])[torch.arange(40) % 2]
     found = Localizer(rig, root=root)(pixels)
     named = found.bad & (found.status == OK)[:, None]
     # Of three views, an error along a line that the others allow may be anyone's; such rows say so.
@@ -117,8 +116,7 @@ def test_a_wrong_view_is_named_and_left_out(count: int) -> None:
     assert (named[rows].to(int).argmax(-1) == wrong[rows]).all()
     assert (found.misfit[rows].argmax(-1) == wrong[rows]).all()
     assert (found.enu - points)[rows].norm(dim=-1).max() < 5.0
-    rest = (found.status != OK).nonzero()[:, 0]
-    assert (found.status[rest] == int(PositionStatus.CONTRADICTION)).all()
+    assert (found.status[(found.status != OK).nonzero()[:, 0]] == int(PositionStatus.CONTRADICTION)).all()
 
 
 def test_good_views_are_left_alone() -> None:
@@ -164,8 +162,7 @@ def test_one_camera_with_a_stated_height() -> None:
     root = rig.with_errors(attitude_deg=0.02, refraction=0.1)
     locate = Localizer(rig, root=root)
     seen = torch.tensor([False, True, False]).expand(5, 3)
-    pixels = marks(rig, points)
-    found = locate(pixels, seen, height=height, height_sigma=2.0)
+    found = locate(marks(rig, points), seen, height=height, height_sigma=2.0)
     assert (found.status == OK).all()
     assert (found.enu - points).norm(dim=-1).max() < 0.02
     generator, many = torch.Generator().manual_seed(4), points.repeat(400, 1)

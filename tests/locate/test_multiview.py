@@ -55,8 +55,7 @@ def test_likelihood_weighs_by_covariance_and_its_covariance_is_true() -> None:
     # One camera is ten times worse than the others, along one axis.
     roots = torch.stack([0.1 * torch.eye(2), tensor([1.0, 0.0], [0.2, 0.1]).float(), 0.1 * torch.eye(2)]).double()
     marks = seen(point) + (roots @ torch.randn(n, 3, 2, 1, dtype=torch.float64, generator=generator))[..., 0]
-    cov = roots @ roots.mT
-    found = views()(marks, cov=cov)
+    found = views()(marks, cov=roots @ roots.mT)
     rays = torch.stack([camera.unproject(marks[:, c])[0] for c, camera in enumerate(CAMERAS)], -2)
     closed = [triangulate(poses(), rays, method=method).points for method in ("linear", "angular")]
     errors = [float((one - point).square().sum(-1).mean().sqrt()) for one in (found.enu, *closed)]

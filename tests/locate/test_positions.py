@@ -125,8 +125,7 @@ def test_cameras_stand_and_look_where_they_should() -> None:
 
 def test_geojson_follows_rfc_7946(tmp_path: Path) -> None:
     located = mixed()
-    path = write_positions(tmp_path / "points.geojson", located)
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = json.loads(write_positions(tmp_path / "points.geojson", located).read_text(encoding="utf-8"))
     # Section 4: no other coordinate system, hence no "crs"; section 3.3: these members and no others.
     assert set(content) == {"type", "features"}
     assert content["type"] == "FeatureCollection"

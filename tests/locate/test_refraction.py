@@ -84,10 +84,8 @@ def test_heights_have_the_errors_that_are_stated() -> None:
                 covariance = torch.block_diag(mounting.covariance[:6, :6], mounting.covariance[6:, 6:])
                 rig.mounting = dataclasses.replace(mounting, covariance=covariance)
             # Marks without noise: what is left is the rig's and the light's.
-            localize = Localizer(rig, pixel_sigma=1e-3)
-            found = localize(*pixels)
-            there = enu_to_geodetic(target, ORIGIN)
-            error = float((found.geodetic - there)[0, 2])
+            found = Localizer(rig, pixel_sigma=1e-3)(*pixels)
+            error = float((found.geodetic - enu_to_geodetic(target, ORIGIN))[0, 2])
             ratio = float((target - CENTER[0]).norm() / found.enu.norm())
             # The height where the range is the true one.
             error = float(((found.enu[0] * ratio - (target - CENTER[0])[0]) * upward).sum())

@@ -40,8 +40,7 @@ def test_covariance_is_that_of_moving_rig_and_mounting() -> None:
     rig = real_rig()
     left, right = rig(POINTS)[0].unbind(-2)
     plain = Localizer(rig.placed(origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5), pixel_sigma=0.1)
-    start = plain(left, right)
-    expected = start.covariance.clone()
+    expected = plain(left, right).covariance.clone()
     values, vectors = torch.linalg.eigh(joint())
     for step in (vectors * values.clamp_min(0).sqrt()).T:
         ends = []

@@ -79,8 +79,7 @@ def test_errors_are_those_of_the_localizer() -> None:
     area = area_of((44.99, 5.985, 45.01, 6.015), level_ground(800.0), sites, cells=8)
     found = siting_map(area, sites)
     geodetic = torch.stack([*torch.meshgrid(area.lat, area.lon, indexing="ij"), area.ground], -1)
-    points = geodetic_to_enu(geodetic, ORIGIN).reshape(-1, 3)
-    located = Localizer(rig, pixel_sigma=1.0)(marks(rig, points))
+    located = Localizer(rig, pixel_sigma=1.0)(marks(rig, geodetic_to_enu(geodetic, ORIGIN).reshape(-1, 3)))
     assert bool((located.status == 0).all())
     # Standard refraction is common to all in the localizer, and moves heights alone.
     there = located.covariance[:, :2, :2].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
@@ -89,8 +88,7 @@ def test_errors_are_those_of_the_localizer() -> None:
 
 
 def test_what_is_outside_an_image_is_not_seen() -> None:
-    rig = ring(2, 6000.0)
-    looking = sites_of(rig)[0]
+    looking = sites_of(ring(2, 6000.0))[0]
     area = area_of((44.9, 5.9, 45.1, 6.1), level_ground(800.0), [looking], cells=20)
     through_lens = siting_map(area, [looking]).sees[0]
     width = 2 * math.degrees(math.atan(960 / 1600))

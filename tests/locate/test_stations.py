@@ -140,8 +140,7 @@ def test_a_stereo_rig_gives_the_same_positions_and_covariances(tmp_path: Path, m
     if mounted:
         rig.mounting = Mounting(origin=ORIGIN, heading_deg=35.0, pitch_deg=-1.0, roll_deg=0.5, refraction=0.1)
         rig.relative_root = half
-    points = spread_points(torch.linspace(80.0, 400.0, 5, dtype=torch.float64))
-    left, right = rig(points)[0].unbind(-2)
+    left, right = rig(spread_points(torch.linspace(80.0, 400.0, 5, dtype=torch.float64)))[0].unbind(-2)
     right = right + tensor(0.05, 0.0)
     many = Localizer(load_rig(save_rig(rig, tmp_path / "rig.json")))
     found = many(torch.stack([left, right], 1))
@@ -153,8 +152,7 @@ def test_a_stereo_rig_gives_the_same_positions_and_covariances(tmp_path: Path, m
     else:
         # Without a place on the Earth there are straight lines, in the left camera's frame.
         other = Localizer(rig.placed(origin=ORIGIN, heading_deg=0.0, refraction=0.0, refraction_sigma=0.0))(left, right)
-        turned = other.enu @ tensor([1, 0, 0], [0, 0, 1], [0, -1, 0])
-        assert torch.allclose(found.enu, turned, atol=0.01)
+        assert torch.allclose(found.enu, other.enu @ tensor([1, 0, 0], [0, 0, 1], [0, -1, 0]), atol=0.01)
     assert (found.enu.norm(dim=-1) - other.enu.norm(dim=-1)).abs().max() < 0.01
     if mounted:
         # The same errors, which also weigh the marks here: no direction is worse for it.

@@ -89,8 +89,7 @@ def test_lines_that_cross_behind_one_camera() -> None:
     # The lines meet at (0.5 m, 0, 4 m): 6 m behind the right camera, whose ray leads away from it.
     behind = Localizer(rig)(tensor([959.5 + 800 / 8, 539.5]), tensor([959.5 + 800 / 12, 539.5]))
     left, right = rig(tensor([3.0, 0.0, 20.0]))[0].unbind(-2)
-    ahead = Localizer(rig)(left, right)
-    assert PositionStatus(int(ahead.status)).name == "OK"
+    assert PositionStatus(int(Localizer(rig)(left, right).status)).name == "OK"
     assert PositionStatus(int(behind.status)).name == "BEHIND"
     assert behind.enu.abs().max() == 0
 
@@ -109,8 +108,7 @@ def test_parallax_and_its_noise_use_the_local_size_of_a_pixel() -> None:
     focal, sigma = 1600.0, 0.3
     rig = pinhole_rig(focal, 1e-3)
     # A baseline of 1 mm: both cameras see the point at the same place in the image.
-    points = tensor([0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, 0.3, 1.0])
-    left, right = rig(points)[0].unbind(-2)
+    left, right = rig(tensor([0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, 0.3, 1.0]))[0].unbind(-2)
     result = Localizer(rig, pixel_sigma=sigma)(left, right)
     # Along u, off axis by angle a: d(angle)/du = cos²(a) / f; above the axis only the distance grows: cos(a) / f.
     expected = tensor(1.0, 1 / 1.25, 1 / math.sqrt(1.09)) * math.sqrt(2) * sigma / focal

@@ -10,14 +10,12 @@ import torch
 from command_line import Command, rows_of
 from typer.testing import CliRunner
 
+from kcal import FileError, InputError, Localizer, save_rig
 from kcal.cli.main import app
 from kcal.cli.rig_sources import images_by_camera
-from kcal.errors import FileError, InputError
-from kcal.io.rig_file import save_rig
+from kcal.locate import enu_to_geodetic, geodetic_to_enu
 from kcal.locate import marks as tables
 from kcal.locate.budget import range_sigmas, station_sigmas
-from kcal.locate.geodesy import enu_to_geodetic, geodetic_to_enu
-from kcal.locate.localizer import Localizer
 from kcal.locate.marks import Marks, read_mark_chunks, read_marks
 from kcal.locate.points import PointLocator, PositionSample
 from kcal.locate.stations import stations_of

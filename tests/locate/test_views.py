@@ -39,8 +39,7 @@ class TestTables:
         torch.testing.assert_close(views.pixels, wanted, equal_nan=True, rtol=0, atol=0)
         sigma = tensor([0.5, nan, nan], [nan, 0.25, nan], [nan, 2.0, nan])
         torch.testing.assert_close(views.sigma, sigma, equal_nan=True, rtol=0, atol=0)
-        stated = views.sigmas(0.3)
-        assert stated[0].nan_to_num(nan=-1.0).tolist() == [0.5, -1.0, 0.3]
+        assert views.sigmas(0.3)[0].nan_to_num(nan=-1.0).tolist() == [0.5, -1.0, 0.3]
         assert views.extras == {"time": ["0", "1", "1"], "kind": ["steel", "", "x"]}
 
     def test_a_name_twice_without_times_is_one_thing(self, tmp_path: Path) -> None:
@@ -115,8 +114,7 @@ class TestPositions:
         # Forty pixels: what a wrong mark is.
         pixels[3, 1, 0] += 40.0
         pixels[4] = math.nan
-        names = tuple(f"thing {i}" for i in range(5))
-        return points, Marks(names, pixels, extras={"time": list("01234")})
+        return points, Marks(tuple(f"thing {i}" for i in range(5)), pixels, extras={"time": list("01234")})
 
     def test_positions_and_what_is_said_of_them(self) -> None:
         points, views = self.views()

@@ -132,8 +132,7 @@ def test_a_whole_site_while_the_server_is_killed(site: tuple[Path, MarkingSite],
          "--pixel-sigma", str(solved["sigma"]), "-o", str(output)],
     )  # fmt: skip
     assert done.exit_code == 0, done.output
-    baseline = float(load_rig(output).baseline)
-    assert baseline == pytest.approx(float(scene.rig.baseline), abs=0.1)
+    assert float(load_rig(output).baseline) == pytest.approx(float(scene.rig.baseline), abs=0.1)
     done = runner.invoke(app, ["locate", str(output), str(tmp_path / "marks.points.csv"), "--refraction", "0"])
     assert done.exit_code == 0, done.output
     assert "the noise that the CSV states" in done.output

@@ -243,8 +243,7 @@ class TestLiveRig:
         cameras = site.rig.left, site.rig.right
 
         def total(marks: Marks) -> list[float]:
-            found = solve_live(cameras, survey, marks, 0.3)
-            return [promise.rig or math.nan for promise in found.promises]
+            return [promise.rig or math.nan for promise in solve_live(cameras, survey, marks, 0.3).promises]
 
         before = total(Marks.of_pair(whole.names[:7], whole.left[:7], whole.right[:7], whole.covariance[:7]))
         one, missing = whole.covariance.clone(), whole.right.clone()

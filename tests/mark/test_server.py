@@ -99,8 +99,7 @@ def test_a_click_outside_the_picture_is_no_mark(client: TestClient) -> None:
         answer = do(client, action, f"outside-{number}")
         assert answer.status_code == 400
         assert "outside the left picture, which has 100x100 pixels" in answer.json()["error"]
-    state = client.get("/api/state").json()
-    assert state["items"][0]["left"] is None
+    assert client.get("/api/state").json()["items"][0]["left"] is None
     for number, (u, v) in enumerate(((-0.5, 5), (99.5, 99.5))):
         action = {"do": "put", "name": "a", "side": "left", "mark": {**MARK, "u": u, "v": v}}
         assert do(client, action, f"border-{number}").status_code == 200
@@ -137,8 +136,7 @@ def test_a_full_disk_is_told_and_what_was_answered_stays(
     assert client.get("/api/state").json()["version"] == 1 + answers.count(200)
     again = Journal(Path(shutil.copy(tmp_path / "marks.log", tmp_path / "copy.log")))
     assert (again.count, again.notes) == (1 + answers.count(200), [])
-    mark = again.state.items["a"].left
-    assert mark.u == last
+    assert again.state.items["a"].left.u == last
 
 
 def test_tables_that_cannot_be_written_are_told(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -318,8 +318,7 @@ def test_marks_of_a_target_are_of_one_moment(tmp_path: Path, survey: Path) -> No
 
 def test_a_match_that_ends_keeps_its_whole_error(session: Session) -> None:
     session.do(put("truck", "left", mark(50.0, 60.0, 0.02)), "key-0007")
-    right = session.state.items["truck"].right
-    assert right.cov[0] == pytest.approx(0.3**2 + 0.05**2)
+    assert session.state.items["truck"].right.cov[0] == pytest.approx(0.3**2 + 0.05**2)
     assert float(pair_covariance(session.state.items["truck"])[0, 2]) == 0.0
 
 

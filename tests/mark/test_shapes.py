@@ -60,8 +60,7 @@ def test_patterns() -> None:
     np.testing.assert_allclose(cross[:, 1], 1 - (1 - bar) * (1 - (2 * ndtr(2.0) - 1)))
     blob = BLOB.patterns(x, np.array([*right, 0.0, 2.0, 5.0, 1.5]))
     np.testing.assert_allclose(blob[:, 1], np.exp(-0.5 * np.maximum((AXIS / 2) ** 2, 1e-12) ** 1.5))
-    upright = BLOB.patterns(x[:, ::-1], np.array([*right, 0.0, 5.0, 2.0, 1.5]))
-    np.testing.assert_allclose(upright, blob)
+    np.testing.assert_allclose(BLOB.patterns(x[:, ::-1], np.array([*right, 0.0, 5.0, 2.0, 1.5])), blob)
     corner = CORNER.patterns(x, np.array([*right, 0.0, math.pi / 2, 0.5]))
     np.testing.assert_allclose(
         corner, np.stack([0 * AXIS + 1, ndtr(AXIS / 0.5), 0 * AXIS + 0.5, ndtr(AXIS / 0.5) / 2], -1)

@@ -175,8 +175,7 @@ def test_inputs_are_shares_of_the_largest_coefficient_and_corrections_small_ones
 
 
 def test_slopes_are_those_of_autograd_and_numeric_ones() -> None:
-    start = start_of("opencv14")
-    residual = ResidualNet(start, hidden=3)
+    residual = ResidualNet(start_of("opencv14"), hidden=3)
     weights = random_weights(residual, 1)
     wanted = torch.func.jacrev(residual.parameters_at)(weights)[list(residual.corrected)]
     torch.testing.assert_close(residual.slopes(weights), wanted)
@@ -263,8 +262,7 @@ def test_rows_are_the_derivatives(skip: bool) -> None:
     by_shared, by_local = torch.func.jacfwd(residuals, argnums=(0, 1))(shared, local)
     torch.testing.assert_close(rows[:, -1], residuals(shared, local))
     torch.testing.assert_close(rows[:, 6:-1], by_shared.transpose(1, 2))
-    own = by_local.diagonal(dim1=0, dim2=2).permute(2, 1, 0)
-    torch.testing.assert_close(rows[:, :6], own)
+    torch.testing.assert_close(rows[:, :6], by_local.diagonal(dim1=0, dim2=2).permute(2, 1, 0))
 
 
 def test_levenberg_marquardt_fits_it() -> None:

@@ -40,8 +40,7 @@ def test_leading_dimensions() -> None:
     inputs, weights = random_net(widths, 3, 2)
     net = evaluate_with_slopes(inputs, weights, widths)
     for i in range(3):
-        single = evaluate_with_slopes(inputs[i, 1], weights, widths)
-        for got, wanted in zip(net, single, strict=True):
+        for got, wanted in zip(net, evaluate_with_slopes(inputs[i, 1], weights, widths), strict=True):
             torch.testing.assert_close(got[i, 1], wanted)
 
 

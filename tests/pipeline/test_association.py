@@ -45,8 +45,7 @@ def site(count: int, seed: int, sigma: float = 1.0) -> tuple[Rig, Detections, De
     rig = rig_of()
     distance = 10 ** torch.empty(count, dtype=torch.float64).uniform_(2.0, 3.7, generator=random)
     place = torch.stack([torch.empty(count).uniform_(-low, low, generator=random) for low in (0.4, 0.2)], -1).double()
-    points = torch.cat([place, torch.ones(count, 1)], -1) * distance[:, None]
-    left, right = rig(points)[0].unbind(-2)
+    left, right = rig(torch.cat([place, torch.ones(count, 1)], -1) * distance[:, None])[0].unbind(-2)
     order = torch.randperm(count, generator=random)
     noise = sigma * torch.randn(2, count, 2, dtype=torch.float64, generator=random)
     return rig, seen(left + noise[0]), seen((right + noise[1])[order]), order

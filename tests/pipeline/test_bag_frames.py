@@ -7,9 +7,8 @@ import pytest
 from bags import KINDS, START, Written, raw, write_bag
 from command_line import Command, rows_of
 
+from kcal import FileError, KcalWarning, save_rig
 from kcal.capture.session import shots
-from kcal.errors import FileError, KcalWarning
-from kcal.io.rig_file import save_rig
 from kcal.mark.guide import open_pictures
 from kcal.pipeline.video_source import FramesTogether, file_frames
 from tests.helpers.scene_pairs import pair, small_rig

@@ -61,8 +61,7 @@ def test_a_batch_is_paired_as_each_of_its_moments() -> None:
     at = found.match.clamp_min(0)[..., None].expand(-1, -1, 2)
     assert torch.equal(found.right[found.mask], middles.gather(1, at)[found.mask])
     # What has no partner is harmless to a localizer.
-    where = Localizer(rig)(found.left, found.right, mask=found.mask)
-    assert bool(torch.isfinite(where.enu).all())
+    assert bool(torch.isfinite(Localizer(rig)(found.left, found.right, mask=found.mask).enu).all())
 
 
 def test_kinds_and_empty_images() -> None:

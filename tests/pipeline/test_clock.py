@@ -222,8 +222,7 @@ def test_live_streams_without_partners_are_told(monkeypatch: pytest.MonkeyPatch)
 
 def test_counts_in_words() -> None:
     assert str(VideoCounts(frames={"left": 1200, "right": 7}, paired=5)) == "videos: 1,200 and 7 frames, 5 pairs"
-    many = VideoCounts(frames={"a": 1, "b": 2, "c": 3}, paired=1, undecoded=2, dropped=4)
-    assert str(many) == (
+    assert str(VideoCounts(frames={"a": 1, "b": 2, "c": 3}, paired=1, undecoded=2, dropped=4)) == (
         "videos: 1, 2 and 3 frames, 1 groups; 2 damaged or out of order, left out; 4 groups dropped for lack of time"
     )
 

@@ -102,8 +102,7 @@ def test_kornia() -> None:
     assert torch.equal(Detections.read(boxes, size=SIZE).boxes, CENTERS)
     inclusive = kornia.geometry.boxes.Boxes.from_tensor(torch.tensor([[100.0, 50.0, 111.0, 61.0]]), mode="xyxy_plus")
     assert torch.equal(Detections.read(inclusive, size=SIZE).boxes, CENTERS[:1])
-    points = kornia.geometry.keypoints.Keypoints(torch.tensor([[30.0, 40.25]]))
-    found = Detections.read(points, size=SIZE)
+    found = Detections.read(kornia.geometry.keypoints.Keypoints(torch.tensor([[30.0, 40.25]])), size=SIZE)
     assert found.anchors(0).tolist() == found.anchors().tolist() == [[30.0, 40.25]]
 
 
@@ -198,8 +197,7 @@ BOX = [[1.0, 2.0, 5.0, 6.0]]
 @pytest.fixture
 def module(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     made = types.ModuleType("my_detector")
-    inner = types.SimpleNamespace(call=lambda image: BOX)
-    vars(made).update(plain=lambda image: BOX, inner=inner, number=3)
+    vars(made).update(plain=lambda image: BOX, inner=types.SimpleNamespace(call=lambda image: BOX), number=3)
     monkeypatch.setitem(sys.modules, "my_detector", made)
     return made
 

@@ -329,8 +329,7 @@ def objects(masks: Tensor | None = None) -> _Objects:
 def test_the_ellipse_in_a_box() -> None:
     """One up to .85 of its radii, zero from 1.15 of them, and half in the middle between."""
     at = torch.tensor([[20.0, 24.0], [28.4, 24.0], [30.0, 24.0], [20.0, 28.0], [20.0, 28.7], [31.5, 24.0]]).double()
-    weight = objects().weight(at[None, None])[0, 0]
-    assert weight.tolist() == pytest.approx([1.0, 1.0, 0.5, 0.5, 0.0, 0.0])
+    assert objects().weight(at[None, None])[0, 0].tolist() == pytest.approx([1.0, 1.0, 0.5, 0.5, 0.0, 0.0])
     slope = objects().weight(torch.tensor([[[[29.4, 24.0]]]]).double())
     assert float(slope) == pytest.approx((1.15 - 0.94) / 0.3)
 

@@ -66,8 +66,7 @@ class TestSharedErrors:
             normal = normal + effect[..., k].T @ weight @ effect[..., k]
             right = right + effect[..., k].T @ weight @ innovation[..., k]
         best, spread = torch.linalg.solve(normal, right), torch.linalg.inv(normal)
-        move = shared.settle()
-        torch.testing.assert_close(move, best[1:])
+        torch.testing.assert_close(shared.settle(), best[1:])
         torch.testing.assert_close(shared.values, torch.tensor([0.5, 0.0, 0.0]).double() + best[1:])
         # The calibration keeps its prior; what the clock knows is correlated with it.
         known = shared.root @ shared.root.T
@@ -291,8 +290,7 @@ class TestSizes:
         for shift, alike in ((0, True), (8, True), (-8, True), (30, False)):
             found = float(appearance(noise, box, noise.roll((shift, -shift), (0, 1)), box))
             assert (found > 0.95) is alike, (shift, found)
-        inverse = float(appearance(noise, box, 3.0 - noise, box))
-        assert inverse < 0.9
+        assert float(appearance(noise, box, 3.0 - noise, box)) < 0.9
         assert float(appearance(noise, box, torch.full_like(noise, 3.0), box)) == 0.0
 
 
@@ -380,8 +378,7 @@ def test_derivatives(turned: bool) -> None:
     turn = rotation_from_vector(torch.tensor([0.1, -0.3, 0.2]).double())[..., None] if turned else None
     step = after(MOTIONS, 0.7)
     models = len(MOTIONS)
-    here = state[:, None, None].expand(6, models, 1)
-    found = moved(here, step, turn)
+    found = moved(state[:, None, None].expand(6, models, 1), step, turn)
     slope = found.through(torch.eye(6).double()[..., None, None].expand(6, 6, models, 1))
     for model in range(models):
         by_autograd = torch.autograd.functional.jacobian(
@@ -500,8 +497,7 @@ def test_elimination_whatever_the_units(size: int) -> None:
     torch.testing.assert_close(solved(done) * scale, stacked_solution(matrix, columns, unit), rtol=1e-9, atol=1e-10)
     torch.testing.assert_close(done.pivots.log().sum(0), torch.linalg.slogdet(stacked(matrix))[1], rtol=1e-9, atol=1e-9)
     white = (done.columns.square() / done.pivots[:, None]).sum(0)
-    expected = (columns * solved(done)).sum(0)
-    torch.testing.assert_close(white, expected, rtol=1e-9, atol=0.0)
+    torch.testing.assert_close(white, (columns * solved(done)).sum(0), rtol=1e-9, atol=0.0)
 
 
 def stacked_solution(matrix: torch.Tensor, columns: torch.Tensor, unit: torch.Tensor) -> torch.Tensor:
@@ -549,8 +545,7 @@ def test_smoothed_states_are_consistent_and_sharper() -> None:
     # 40 values of chi-squared with three degrees of freedom.
     assert 2.2 < float((error.mT @ torch.linalg.solve(covariance, error)).mean()) < 3.9
     # The last moment is the filter's, and the first is much better known than when it was seen.
-    last = torch.stack([track.state.enu[-1] for track in found])
-    torch.testing.assert_close(last, tracks.state.enu)
+    torch.testing.assert_close(torch.stack([track.state.enu[-1] for track in found]), tracks.state.enu)
     first = torch.stack([track.state.covariance[0, 1, 1] - track.state.systematic[0, 1, 1] for track in found])
     one = localize(*(torch.cat(side) for side in zip(*marks, strict=True)))
     assert bool((first < 0.5 * one.covariance[:, 1, 1]).all())

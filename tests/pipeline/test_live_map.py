@@ -228,8 +228,7 @@ def test_names_cover_neither_each_other_nor_dots(width: int, height: int) -> Non
 
 
 def serve(answer: Any) -> None:
-    page = LiveMap(run_of(SITE), 0)
-    answer.send(page.address)
+    answer.send(LiveMap(run_of(SITE), 0).address)
     answer.recv()
 
 

@@ -59,8 +59,7 @@ def test_bottom_anchors_are_the_same_distance_away() -> None:
     site = Site(1)
     pairs = pair_objects(site.rig, site.left, site.right, site.images, options=AssociationOptions(anchor="bottom"))
     assert torch.equal(pairs.left, site.left.anchors("bottom"))
-    disparity = (pairs.left - pairs.right)[:, 0]
-    assert torch.allclose(disparity, 16000.0 / site.depths, atol=0.4)
+    assert torch.allclose((pairs.left - pairs.right)[:, 0], 16000.0 / site.depths, atol=0.4)
     assert float((pairs.left - pairs.right)[:, 1].abs().max()) < 0.4
 
 

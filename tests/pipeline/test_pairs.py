@@ -24,8 +24,7 @@ def pairs(**changes: object) -> ObjectViews:
 
 
 def test_everything_becomes_float64() -> None:
-    found = pairs()
-    numbers = [value for value in vars(found).values() if isinstance(value, torch.Tensor)]
+    numbers = [value for value in vars(pairs()).values() if isinstance(value, torch.Tensor)]
     assert {value.dtype for value in numbers} == {torch.float64, torch.bool}
 
 
@@ -60,8 +59,7 @@ def test_what_cannot_be_is_refused(changes: dict, message: str) -> None:
 
 def test_what_kornia_matched() -> None:
     """SIFT and mutual nearest neighbors, which need no weights; the right image is the left one, shifted."""
-    random = torch.Generator().manual_seed(3)
-    noise = torch.rand(1, 1, 60, 80, generator=random)
+    noise = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(3))
     image = gaussian_blur2d(noise.repeat_interleave(2, 2).repeat_interleave(2, 3), 7, (2.0, 2.0))
     matcher = LocalFeatureMatcher(SIFTFeature(60), DescriptorMatcher("smnn", 0.9))
     found = matcher({"image0": image, "image1": image.roll(-12, 3)})

@@ -106,13 +106,11 @@ class TestPencils:
         base = base / np.linalg.norm(base)
         normal = np.cross(base, ray)
         flat = np.linalg.norm(normal, axis=1)
-        place = (camera + 0.5) / 2000.0
-        wide = gate * np.hypot(sigma, place) + (2e-8 + gate * 1e-9) * FARTHEST_BEND_M
+        wide = gate * np.hypot(sigma, (camera + 0.5) / 2000.0) + (2e-8 + gate * 1e-9) * FARTHEST_BEND_M
         # Within the noise of the base itself, any plane is possible.
         wide = np.where(wide < flat, np.arcsin(np.minimum(wide / flat, 1.0)), math.pi)
         cosine = (normal[rows, None] * normal[None, others]).sum(-1)
-        turned = np.cross(normal[rows, None], normal[None, others]) @ base
-        angle = np.abs(np.arctan2(turned, cosine))
+        angle = np.abs(np.arctan2(np.cross(normal[rows, None], normal[None, others]) @ base, cosine))
         limit = np.hypot(wide[rows, None], wide[None, others])
         wanted = {(int(i), int(j) + 200) for i, j in zip(*np.nonzero(angle <= limit), strict=True)}
         assert found == wanted
@@ -166,8 +164,7 @@ class TestGroups:
         assert done.squared.sum() > 1.0
 
     def test_bent_light_leads_to_the_point(self) -> None:
-        lines = sights(bending=6e-8)
-        done = confirming(lines)._fit(marks_of(0, 1, 2))
+        done = confirming(sights(bending=6e-8))._fit(marks_of(0, 1, 2))
         np.testing.assert_allclose(done.point, POINTS, atol=1e-2)
         assert float(done.squared.max()) < 1e-3
 
@@ -177,8 +174,7 @@ class TestGroups:
         lines = sights(turned=1.2, seed=3)
         trees = confirming(lines, gate)
         own, found = trees._trees(np.ones(15, dtype=bool))
-        done = trees._fit(marks_of(0, 1, 2))
-        marks, near = trees._nearest(done, own, found)
+        marks, near = trees._nearest(trees._fit(marks_of(0, 1, 2)), own, found)
         for c in range(5):
             for p in range(3):
                 others = marks_of(p)[0].copy()
@@ -243,8 +239,7 @@ class TestGroups:
         for behind, clear in ((3.0, True), (1.0, False)):
             some = self.groups(np.stack([first, mixed]))
             some.squared[1] += behind / 5.0
-            kept = trees._chosen(some, 0).marks.tolist()
-            assert kept == ([first.tolist()] if clear else [])
+            assert trees._chosen(some, 0).marks.tolist() == ([first.tolist()] if clear else [])
         # One that differs in one mark only is no rival: marks are settled one by one.
         one_off = first.copy()
         one_off[4] = second[4]
@@ -334,8 +329,7 @@ def lines(points: torch.Tensor, center: torch.Tensor, bending: float = 0.0, turn
 @pytest.mark.parametrize("bending", [0.0, 1e-8])
 def test_lines_of_sight_meet_where_the_thing_is(bending: float) -> None:
     """On all sides of the cameras, also where angles of the pencil pass a half turn; bent light is straightened."""
-    g = torch.Generator().manual_seed(0)
-    points = 20_000.0 * torch.randn(200, 3, generator=g).double()
+    points = 20_000.0 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0)).double()
     center = torch.tensor([[0.0, 0.0, 0.0], [4000.0, 3000.0, 100.0]]).double()
     seen, every = lines(points, center, bending), np.arange(200)
     found = meetings(seen, every, every + 200, 4.0, 1000.0)
@@ -405,8 +399,7 @@ def test_a_crowd_is_grouped_as_it_is(missed: float, false: int) -> None:
 def test_how_far_two_lines_pass() -> None:
     """Rays of σ 1 mrad from two stations pass 3 m apart at 800 and 1000 m: 9 / (.8² + 1²) variances."""
     ray = np.array([[0.0, 1.0, 0.0], [-0.6, 0.8, 0.003]])
-    center = np.array([[0.0, 0.0, 0.0], [600.0, 0.0, 0.0]])
-    lines = two_sights(ray, center, 1e-3)
+    lines = two_sights(ray, np.array([[0.0, 0.0, 0.0], [600.0, 0.0, 0.0]]), 1e-3)
     found = meetings(lines, np.array([0]), np.array([1]), 4.0, 100.0)
     assert found.squared.tolist() == pytest.approx([9.0 / 1.64], rel=0.01)
     # Nearer to the line that is known better there.

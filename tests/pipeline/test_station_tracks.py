@@ -174,8 +174,7 @@ def test_the_clock_of_each_camera_is_found() -> None:
 
 
 def test_refusals() -> None:
-    rig = stations()
-    localize = Localizer(rig)
+    localize = Localizer(stations())
     with pytest.raises(InputError, match="tower 2 need a time"):
         group_objects(localize, [None, dataclasses.replace(boxes(torch.zeros(1, 2)), time=None), None])
     with pytest.raises(InputError, match="of 3 cameras"):

@@ -262,8 +262,7 @@ def test_what_is_told_may_be_differentiated_further() -> None:
     (weight * tracks.state.enu).sum().backward()
     assert weight.grad is not None
     assert torch.equal(weight.grad, tracks.state.enu)
-    again = copy.deepcopy(tracker).tracks()
-    assert torch.equal(again.state.enu, tracks.state.enu)
+    assert torch.equal(copy.deepcopy(tracker).tracks().state.enu, tracks.state.enu)
 
 
 def test_what_is_seen_once_is_not_told() -> None:
@@ -271,14 +270,12 @@ def test_what_is_seen_once_is_not_told() -> None:
     tracker = Tracker(localize)
     left, right = localize.rig(torch.tensor([[0.0, 0.0, 300.0]]).double())[0].unbind(-2)
     assert tracker(pairs_of(left, right, 0.0)).number == ()
-    nothing = pairs_of(left[:0], right[:0], 0.0)
-    assert tracker(nothing, 5.0).number == ()
+    assert tracker(pairs_of(left[:0], right[:0], 0.0), 5.0).number == ()
     assert tracker.records == []
 
 
 def test_time_must_be_given_and_must_not_go_back() -> None:
-    localize = tracked_site()
-    tracker = Tracker(localize)
+    tracker = Tracker(tracked_site())
     nothing = pairs_of(torch.zeros(0, 2).double(), torch.zeros(0, 2).double(), 0.0)
     with pytest.raises(InputError, match="give the time"):
         tracker(nothing)
@@ -315,8 +312,7 @@ def test_tracks_are_tables() -> None:
         assert ours[name].to_list() == [*value[:2].tolist(), None]
     assert (ours["range_low_m"] < ours["range_m"]).to_list() == [True, True, None]
     columns = track_columns(tracks, 1)
-    texts = {*TEXTS, *NUMBERS, *columns.extras}
-    assert set(ours.columns) <= texts
+    assert set(ours.columns) <= {*TEXTS, *NUMBERS, *columns.extras}
     assert torch.tensor(ours["range_m"][:2]) == pytest.approx(columns.column("range_m")[:2], rel=1e-6)
     smoothed = tracker.smoothed()[0]
     table = pandas.DataFrame.from_arrow(smoothed.to_arrow())

@@ -97,8 +97,7 @@ def test_filter_and_smoother_are_those_of_stone_soup() -> None:
         # Stone Soup does not tell a model from where it is asked for its noise.
         StraightLine.at = track[-1]
         prediction = predictor.predict(track[-1], timestamp=when)
-        hypothesis = SingleHypothesis(prediction, Detection(measured, timestamp=when))
-        track.append(updater.update(hypothesis))
+        track.append(updater.update(SingleHypothesis(prediction, Detection(measured, timestamp=when))))
     scale = np.array([1e-4, 1e-4, 1e-5, 1e-4, 1e-4, 1e-4])
     for (mean, noise), state in zip(filtered, track, strict=True):
         np.testing.assert_allclose(mean.numpy() / scale, np.asarray(state.state_vector, float).ravel() / scale,

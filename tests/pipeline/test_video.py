@@ -81,8 +81,7 @@ def test_nearest_frames_each_once() -> None:
     assert all(abs(one - other) <= 0.0201 for one, other in turned)
     gap = [time for time in fast if not 0.3 < time < 0.7]
     assert [one for one, _ in paired(slow, gap, apart=0.05)] == [0.0, 0.1, 0.2, 0.3, 0.7, 0.8, 0.9]
-    shifted = paired(slow, [time + 5.0 for time in slow], late=-5.0)
-    assert shifted == [(time, time + 5.0) for time in slow]
+    assert paired(slow, [time + 5.0 for time in slow], late=-5.0) == [(time, time + 5.0) for time in slow]
     assert paired(slow, []) == paired([], fast) == []
 
 
@@ -172,8 +171,7 @@ def test_a_handover_waits_or_drops_the_oldest() -> None:
             yield number
         release.set()
 
-    waiting = Handover(numbers(), 4, waits=True)
-    got = iter(waiting)
+    got = iter(Handover(numbers(), 4, waits=True))
     assert [next(got) for _ in range(3)] == [0, 1, 2]
     assert len(made) <= 3 + 4 + 1
     assert list(got) == list(range(3, 100))

@@ -46,9 +46,8 @@ def observed() -> Observations:
 
 def computed(camera: Camera) -> dict[str, object]:
     """Numbers that must not change."""
-    points = torch.tensor(POINTS, dtype=torch.float64)
     return {
-        "pixels": camera.project(points)[0].tolist(),
+        "pixels": camera.project(torch.tensor(POINTS, dtype=torch.float64))[0].tolist(),
         "rays": camera.unproject(torch.tensor(PIXELS, dtype=torch.float64))[0].tolist(),
         "params": camera.params.tolist(),
     }

@@ -70,8 +70,7 @@ def test_lines(name: str) -> None:
 
 def test_a_wrong_line_is_found() -> None:
     number, row = LINES[0]
-    wrong = [row[0], "500.001 400", *row[2:]]
-    assert failures([(number, wrong)]) != []
+    assert failures([(number, [row[0], "500.001 400", *row[2:]])]) != []
     assert failures([(number, [row[0], row[1], "0 0 -1", *row[3:]])]) != []
 
 

@@ -45,15 +45,13 @@ def test_cameras(file: str, tmp_path: Path) -> None:
     for parameter, value in stored.items():
         assert found[parameter] == pytest.approx(value, rel=1e-9) if value else not found[parameter]
     # And what the present version writes of them.
-    again = load_camera(save_camera(camera, tmp_path / "again.json"))
-    same_camera(again, whole[name], whole)
+    same_camera(load_camera(save_camera(camera, tmp_path / "again.json")), whole[name], whole)
 
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_other_files(version: str) -> None:
     folder, whole = FILES / version, computed(version)
-    seen = Observations.load(folder / "observations.json")
-    total = sum(sum(map(sum, view.pixels)) for view in seen.views)
+    total = sum(sum(map(sum, view.pixels)) for view in Observations.load(folder / "observations.json").views)
     assert total == pytest.approx(whole["observations.json"]["sum"], rel=1e-12)
     rig, known = load_rig(folder / "rig.json"), whole["rig.json"]
     close(rig.right_from_left_rotation, known["rotation"])

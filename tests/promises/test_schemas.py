@@ -55,7 +55,6 @@ def test_what_is_written_fits(kind: str, tmp_path: Path) -> None:
 def test_command() -> None:
     told = json.loads(CliRunner().invoke(app, ["schema", "board", "--json"]).stdout)
     assert told["schema"] == file_schema("board")
-    done = CliRunner().invoke(app, ["schema", "rig"])
-    assert json.loads(done.stdout) == file_schema("rig")
+    assert json.loads(CliRunner().invoke(app, ["schema", "rig"]).stdout) == file_schema("rig")
     assert [line.split()[0] for line in CliRunner().invoke(app, ["schema"]).stdout.splitlines()[1:]] == [*FILES]
     assert "no kind of file is called 'car'" in str(CliRunner().invoke(app, ["schema", "car"]).exception)

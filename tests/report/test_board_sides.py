@@ -13,8 +13,7 @@ def test_sides_of_boards_of_unlike_distances(text):
     rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-0.5, 0.0, 0.0]))
     left, right = rig(board.points * 1.02 + torch.tensor([-0.2, 0.1, 2.0], dtype=torch.float64))[0].unbind(-2)
     sides = triangulated_sides(rig, board.columns, board.rows, torch.stack([left, right])[None], board.points)
-    first = float((board.points[1] - board.points[0]).norm())
-    assert sides.mean == pytest.approx(1.02 * first, rel=1e-9)
+    assert sides.mean == pytest.approx(1.02 * float((board.points[1] - board.points[0]).norm()), rel=1e-9)
     assert sides.spread < 1e-9
     with pytest.raises(InputError, match="points: shape"):
         triangulated_sides(rig, board.columns, board.rows, torch.stack([left, right])[None], board.points[1:])

@@ -13,10 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver, QuiverKey
 
+from kcal import Camera, Origin
 from kcal.calibrate.camera.advice import board_tilts
-from kcal.lens.camera import Camera
 from kcal.lens.difference import camera_difference
-from kcal.lens.rig import Origin
 from kcal.locate.siting import Site, siting_map
 from kcal.report import positions as siting_module
 from kcal.report.calibration import camera_pictures, difference_figure
@@ -56,8 +55,7 @@ class TestStars:
         scene = night() | {"pixels": np.random.default_rng(0).uniform(20, 300, (40, 2)), "names": ["x"] * 40,
                            "residual": np.zeros((40, 2))}  # fmt: skip
         assert len(stars_figure(**scene).axes[0].texts) == 30
-        none = night() | {"names": [""] * 6}
-        assert stars_figure(**none).axes[0].get_title(loc="left") == ""
+        assert stars_figure(**night() | {"names": [""] * 6}).axes[0].get_title(loc="left") == ""
 
 
 class TestAttitude:
@@ -112,8 +110,7 @@ class TestSites:
         down = torch.arange(rows, dtype=torch.float64)[:, None] * -30.0 + torch.zeros(columns)
         for ground, bright in ((down, True), (-down, False), (down.new_zeros(rows, columns), None)):
             east = torch.arange(columns, dtype=torch.float64) * (30.0 if bright else -30.0) + torch.zeros(rows, 1)
-            figure = Figure()
-            axes = figure.add_subplot()
+            axes = Figure().add_subplot()
             heights = ground + (0.0 if bright is None else 1.0) * east
             bumpy = heights + (0.0 if bright is None else 1.0) * torch.randn(
                 rows, columns, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
@@ -249,8 +246,7 @@ class TestVerdictPictures:
         some = found.shift.numpy()[1::2, 1::2]
         longest = np.linalg.norm(some, axis=-1).max()
         scale = np.hypot(arrows(axes).U, arrows(axes).V).max() / longest
-        room = 1.5 * 2 * 640 / 33
-        assert scale * longest == pytest.approx(room)
+        assert scale * longest == pytest.approx(1.5 * 2 * 640 / 33)
         np.testing.assert_allclose(arrows(axes).U, scale * some[..., 0].ravel())
         assert figure.texts[0].get_text() == "halves"
         assert axes.get_xlim() == (-0.5, 639.5)

@@ -56,8 +56,7 @@ class TestGallery:
         seen = self.seen(1)
         axes = gallery_figure(seen).axes[0]
         pixels = np.array(seen.views[0].pixels)
-        columns = seen.board.columns
-        np.testing.assert_array_equal(np.stack(axes.lines[0].get_data(), -1), pixels[:columns])
+        np.testing.assert_array_equal(np.stack(axes.lines[0].get_data(), -1), pixels[: seen.board.columns])
         np.testing.assert_array_equal(axes.collections[0].get_offsets(), pixels)
         np.testing.assert_array_equal(axes.collections[1].get_offsets(), pixels[:1])
         assert axes.get_xlim() == (-0.5, 639.5)

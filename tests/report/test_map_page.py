@@ -169,8 +169,7 @@ def test_a_geotiff_lies_where_it_belongs(tmp_path: Path) -> None:
     x, y = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32643", always_xy=True).transform(lon, lat)
     # Half a pixel of 20 m, and the colors of WEBP spread over more.
     assert (x, y) == pytest.approx((273_000 + 70.5 * 20, 2_111_000 - 40.5 * 20), abs=30)
-    page = map_page(scene()[0], image=tmp_path / "ortho.tif")
-    assert data(page)["image"]["name"] == "ortho.tif"
+    assert data(map_page(scene()[0], image=tmp_path / "ortho.tif"))["image"]["name"] == "ortho.tif"
 
 
 def test_tiles_in_view_are_embedded(tmp_path: Path) -> None:

@@ -89,8 +89,7 @@ def test_a_camera_is_the_table_of_the_command_line(calibrated: Any, tmp_path: Pa
 
 
 def test_cameras_that_no_table_shows_have_their_repr() -> None:
-    batch = Camera(CAMERA.params.expand(2, -1), size=CAMERA.size, model=CAMERA.model)
-    assert batch._repr_html_() is None
+    assert Camera(CAMERA.params.expand(2, -1), size=CAMERA.size, model=CAMERA.model)._repr_html_() is None
     assert copy.deepcopy(CAMERA).to("meta")._repr_html_() is copy.deepcopy(RIG).to("meta")._repr_html_() is None
     learned = Camera.build(focal=(900, 900), center=(300, 300), size=(640, 480))
     learned.params.requires_grad_()
@@ -106,8 +105,7 @@ def test_rigs_of_two_cameras_and_of_many() -> None:
     assert [line for line in lines if line not in printed] == []
     look = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     places = torch.tensor([[0.0, 0, 0], [3000, 0, 0], [0, 3000, 0]])
-    stations = Rig([CAMERA] * 3, [NASTY, "b", "c"], look.repeat(3, 1, 1), center=places)
-    found = read(stations)
+    found = read(Rig([CAMERA] * 3, [NASTY, "b", "c"], look.repeat(3, 1, 1), center=places))
     assert found.rows[-3][0].startswith("<b>north & \\x1b[2J")
     assert "no error bars of the poses" in found.text
 

@@ -53,8 +53,7 @@ def test_one_panel_goes_into_axes(name: str) -> None:
 def test_several_panels_go_into_a_figure_or_a_part_of_one(name: str) -> None:
     alone = MANY[name](None)
     figure = plt.figure(figsize=(18, 8), layout="constrained")
-    part = figure.subfigures(1, 2)[0]
-    assert MANY[name](part) is figure
+    assert MANY[name](figure.subfigures(1, 2)[0]) is figure
     assert [content(axes) for axes in figure.axes] == [content(axes) for axes in alone.axes]
     figure.canvas.draw()
     plt.close(figure)

@@ -34,8 +34,7 @@ def scene() -> tuple[Located, torch.Tensor]:
     right = right + tensor([0.3, 0.0])
     names = ["gate", "mast", "ship", "cloud", "lost"]
     located = located_pairs(rig, left, right, origin=PLACE, heading_deg=HEADING, names=names)
-    enu = torch.cat([PLACES @ enu_from_cam(HEADING).T, torch.full((1, 3), math.nan)])
-    return located, enu
+    return located, torch.cat([PLACES @ enu_from_cam(HEADING).T, torch.full((1, 3), math.nan)])
 
 
 def texts(figure: Figure) -> list[str]:

@@ -13,9 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver, QuiverKey
 
-from kcal import Board, Camera, Observations
+from kcal import Board, CalibrationOptions, Camera, Observations, calibrate_camera
 from kcal.calibrate.camera.advice import unreached_share
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.export import Misfit
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, board_text
 from kcal.lens import camera_difference
@@ -74,8 +73,7 @@ def test_places_up_to_the_edges_are_of_an_image_of_that_size() -> None:
 def test_a_view_that_was_left_out_has_no_arrows() -> None:
     seen = observed()
     twice = seen.model_copy(update={"views": (*seen.views, seen.views[0].model_copy(update={"name": "copy.png"}))})
-    result = calibrate_camera(twice, CalibrationOptions(model="opencv4"))
-    figure = calibration_figure(result, "left")
+    figure = calibration_figure(calibrate_camera(twice, CalibrationOptions(model="opencv4")), "left")
     (drawn,) = [part for part in figure.axes[0].collections if isinstance(part, Quiver)]
     assert len(drawn.U) == 8 * BOARD.corners
     assert figure.texts[0].get_text().startswith("left: 8 of 9 views")
@@ -151,8 +149,7 @@ def test_no_axes_cover_each_other(name: str) -> None:
         assert -1 <= box.y0 < box.y1 <= tall + 1
     for one, other in itertools.combinations(axes, 2):
         across = min(one.x1, other.x1) - max(one.x0, other.x0)
-        down = min(one.y1, other.y1) - max(one.y0, other.y0)
-        assert min(across, down) < 1
+        assert min(across, min(one.y1, other.y1) - max(one.y0, other.y0)) < 1
     # Most of the page is used.
     assert sum(box.width * box.height for box in axes) > 0.3 * wide * tall
 
@@ -208,5 +205,4 @@ def test_a_typical_residual_is_a_sixtieth_of_the_image() -> None:
 def test_levels_below_a_millimeter() -> None:
     area, towers, _ = sites()
     found = siting_map(area, towers)
-    tiny = found._replace(sigma=1e-7 * found.sigma)
-    assert _sigma_levels([tiny]) == pytest.approx([1e-3, 2e-3, 5e-3])
+    assert _sigma_levels([found._replace(sigma=1e-7 * found.sigma)]) == pytest.approx([1e-3, 2e-3, 5e-3])

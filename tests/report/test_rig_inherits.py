@@ -42,8 +42,7 @@ def solved(left: CalibrationRecord, right: CalibrationRecord | None = None, **ch
     )  # fmt: skip
     rig.left.calibration = CameraCalibration(name="left", record=left)
     rig.right.calibration = CameraCalibration(name="right", record=right or record(CLEAN))
-    size = rig.left.params.shape[-1]
-    spread = torch.cat([torch.full((2 * size,), 1e-2), torch.full((6,), 1e-6)]).double()
+    spread = torch.cat([torch.full((2 * rig.left.params.shape[-1],), 1e-2), torch.full((6,), 1e-6)]).double()
     rig.covariance = RigCovariance.of(rig, joint=torch.diag(spread.square()))
     known: Any = {"rms": 0.1, "rms_px": (0.1, 0.1), "pairs": 0, "per_pair_rms": {}, "kcal_version": "1", "created": NOW}
     rig.calibration = RigCalibration(**known, **changes)

@@ -6,9 +6,8 @@ import pytest
 import torch
 from locate_rigs import located_pairs, pinhole_rig, tensor
 
-from kcal import Board, Rig
+from kcal import Board, Origin, Rig
 from kcal.locate.budget import range_sigmas
-from kcal.locate.geodesy import Origin
 from kcal.locate.positions import position_errors
 from kcal.report.tables import diagonal_rows, position_rows, range_sigma_rows, truth_rows
 
@@ -57,8 +56,7 @@ def test_units_fit_the_range_and_numbers_their_sigma(
     rig = pinhole_rig()
     rig = Rig.pair(rig.left, rig.right, rig.right_from_left_rotation, scale * rig.right_from_left_translation)
     pixels = rig(tensor([0.0, 0.0, distance]))[0].unbind(-2)
-    located = located_pairs(rig, *pixels, origin=ORIGIN, heading_deg=0.0)
-    head, row = position_rows(located)
+    head, row = position_rows(located_pairs(rig, *pixels, origin=ORIGIN, heading_deg=0.0))
     assert head[4:6] == heads
     assert row[4:6] == cells
 
@@ -72,8 +70,7 @@ def test_a_sum_is_not_known_where_a_part_is_not() -> None:
 
 def test_diagonals_of_pairs_whose_ends_were_both_located() -> None:
     board = Board(columns=5, rows=4, square=1.0)
-    points = tensor([0.0, 0.0, 100.0], [4.0, 3.01, 100.0], [0.0, 0.0, 50.0])
-    left, right = pinhole_rig()(points)[0].unbind(-2)
+    left, right = pinhole_rig()(tensor([0.0, 0.0, 100.0], [4.0, 3.01, 100.0], [0.0, 0.0, 50.0]))[0].unbind(-2)
     located = located_pairs(
         pinhole_rig(), left, right, origin=ORIGIN, heading_deg=0.0, names=["a first", "a last", "b first"]
     )

@@ -14,8 +14,7 @@ from kcal.calibrate.camera import trust
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
 from kcal.calibrate.camera.trust import Examination, HalvesDifference, examine, residual_structure
 from kcal.finding import Finding
-from kcal.lens import rotation_from_vector
-from kcal.lens.difference import camera_difference
+from kcal.lens import camera_difference, rotation_from_vector
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.judge_camera import camera_verdict, stored_verdict, view_findings
 from kcal.report.judge_rig import rig_verdict, synchrony
@@ -153,8 +152,7 @@ def test_the_range_asked_for_decides(clean: CameraCalibrationResult, examination
 
 def judged(pixels: Tensor | Observations, options: CalibrationOptions = OPTIONS, need: str = "300m:5%") -> Verdict:
     seen = pixels if isinstance(pixels, Observations) else observed(pixels)
-    result = calibrate_camera(seen, options)
-    return camera_verdict(result, options, Requirement.parse(need), mark_sigma=0.1)
+    return camera_verdict(calibrate_camera(seen, options), options, Requirement.parse(need), mark_sigma=0.1)
 
 
 def test_a_lens_that_the_model_cannot_hold_is_named(poses: tuple[Tensor, Tensor]) -> None:
@@ -255,8 +253,7 @@ def test_images_of_two_cameras_are_noticed(
     one = camera("opencv5")
     values = one.params.clone()
     values[:2] *= 1.03
-    other = one.with_parameters(values)
-    pixels, second = (seen_by(lens, BOARD.points, *poses) for lens in (one, other))
+    pixels, second = (seen_by(lens, BOARD.points, *poses) for lens in (one, one.with_parameters(values)))
     which = torch.arange(VIEWS) % 2 == 1 if prefixed else torch.arange(VIEWS) >= VIEWS // 2
     labels = [f"{'right' if which[i] else 'left'}{i:02}.png" for i in range(VIEWS)] if prefixed else None
     verdict = judged(observed(torch.where(which[:, None, None], second, pixels), labels))
@@ -271,16 +268,14 @@ def test_few_views_are_doubted(poses: tuple[Tensor, Tensor]) -> None:
 
 def test_residuals_that_repeat_have_structure(clean: CameraCalibrationResult) -> None:
     pixels, size = clean.observations.pixels(), clean.observations.image_size
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
+    noise = torch.randn(pixels.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     plain = residual_structure(noise, pixels, size, clean.observations)
     assert plain.image < 1.6
     assert plain.board < 1.6
     assert abs(plain.neighbors) < 5 * plain.neighbors_sigma
     assert residual_structure(noise + (pixels - 300) / 100, pixels, size, clean.observations).image > 5
     assert residual_structure(noise + noise[:1], pixels, size, clean.observations).board > 5
-    shifted = residual_structure(noise + 2 * noise[:, :1], pixels, size, clean.observations)
-    assert shifted.neighbors > 0.5
+    assert residual_structure(noise + 2 * noise[:, :1], pixels, size, clean.observations).neighbors > 0.5
 
 
 def test_a_camera_that_is_not_from_these_views_is_told(
@@ -327,8 +322,7 @@ def test_pairs_that_were_not_taken_together_are_named(poses: tuple[Tensor, Tenso
     assert 0.5 < found.ratio < 1.6
     moved = 5e-3 * torch.randn(VIEWS, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     rig, pixels = pair_pixels(moved, poses)
-    verdict = rig_verdict(rig, pairs=(BOARD.points, pixels))
-    assert "synchronization" in names(verdict, "stop")
+    assert "synchronization" in names(rig_verdict(rig, pairs=(BOARD.points, pixels)), "stop")
     calm = rig_verdict(rig, pairs=(BOARD.points, pair_pixels(still, poses)[1]))
     assert "synchronization" in names(calm, "fine")
 

@@ -12,9 +12,7 @@ from locate_rigs import located_pairs, pinhole_rig, real_rig, spread_points, ten
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from kcal import Camera, InputError, Localizer, Observations, Origin, Rig, locate_points
-from kcal.corners.board import Board
-from kcal.corners.observations import View
+from kcal import Board, Camera, InputError, Localizer, Observations, Origin, Rig, View, locate_points
 from kcal.locate import Marks, enu_from_cam
 from kcal.locate.positions import Located
 from kcal.locate.survey import Survey
@@ -107,8 +105,7 @@ def test_cameras_stand_where_they_are_and_frames_are_right_handed(tmp_path: Path
     look = enu_from_cam(35.0, -2.0, 0.0)
     for name, turn, center in zip(("left", "right"), rig.rotation, rig.center, strict=True):
         entity = data[f"/cameras/{name}"]
-        place = only(entity["Transform3D:translation"])[0]
-        assert place == pytest.approx((look @ center).numpy(), abs=1e-6)
+        assert only(entity["Transform3D:translation"])[0] == pytest.approx((look @ center).numpy(), abs=1e-6)
         rotation = Rotation.from_quat(only(entity["Transform3D:quaternion"])[0]).as_matrix()
         assert rotation == pytest.approx((look @ turn.T).numpy(), abs=1e-6)
         assert np.linalg.det(rotation) == pytest.approx(1.0)
@@ -145,8 +142,7 @@ def test_positions_have_ellipsoids_intervals_and_labels(tmp_path: Path) -> None:
         assert np.linalg.det(axes[i]) == pytest.approx(1.0)
     assert half[2].max() / half[2].min() > 300
     # The longest axis is the line of sight.
-    long = axes[2][:, half[2].argmax()]
-    assert abs(long @ enu[2]) / np.linalg.norm(enu[2]) > 0.9999
+    assert abs(axes[2][:, half[2].argmax()] @ enu[2]) / np.linalg.norm(enu[2]) > 0.9999
     for line, position in zip(only(data["/targets/intervals"]["LineStrips3D:strips"]), located.positions, strict=True):
         ends = np.linalg.norm(line, axis=-1)
         assert ends == pytest.approx([position.range_low_m, position.range_high_m], rel=1e-6)

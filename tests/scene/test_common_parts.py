@@ -7,9 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcal.lens.camera import Camera
+from kcal import Camera, Rig
 from kcal.lens.pose import rotation_from_vector
-from kcal.lens.rig import Rig
 from kcal.scene import common_errors as parts
 from kcal.scene.common_errors import line_errors
 
@@ -35,8 +34,7 @@ def test_off_the_line_by_so_many_pixels(roll: float) -> None:
     right = (left + apart - middle) @ turn.T + middle
     own = torch.tensor([[0.04, 0.01], [0.01, 0.09]]).double()
     found = line_errors(rig, torch.stack([left, right], 1))
-    sign = float(torch.sign(found.off[0]))
-    assert sign * found.off == pytest.approx([0.7, -0.4, 0.0], abs=1e-3)
+    assert float(torch.sign(found.off[0])) * found.off == pytest.approx([0.7, -0.4, 0.0], abs=1e-3)
     assert found.sigma((turn @ own @ turn.T).expand(3, 2, 2)) == pytest.approx(3 * [0.3], rel=2e-3)
 
 
@@ -104,8 +102,7 @@ def test_classes_of_shares() -> None:
         sizes = found.bincount()
         assert len(sizes) == classes
         assert int(sizes.max() - sizes.min()) <= 1
-        order = share[:count].argsort()
-        assert found[order].tolist() == sorted(found.tolist())
+        assert found[share[:count].argsort()].tolist() == sorted(found.tolist())
 
 
 def test_shifts_between_pairs() -> None:
@@ -183,8 +180,7 @@ def test_one_thing_in_three_pairs_counts_once() -> None:
     fits = [torch.ones(len(own)).double() for own in pixels]
     found = parts.with_common_errors([line_errors(rig, own) for own in pixels], pixels, covariance, fits)
     assert [len(one) for one in found] == [2, 1, 1]
-    ratio = torch.cat(found)[:, 1, 1]
-    assert ratio == pytest.approx([3.0, 1.0, 3.0, 3.0])
+    assert torch.cat(found)[:, 1, 1] == pytest.approx([3.0, 1.0, 3.0, 3.0])
 
 
 def test_learned_parts_against_plain_loops() -> None:

@@ -110,11 +110,9 @@ class TestRefine:
         """Too far away, at the edge of either image, without texture, without a ray: each alone."""
         truth, _ = true_right(self.LEFT)
         images = grays()
-        far = refine_matches(RIG, images, self.LEFT, truth + torch.tensor([25.0, 0.0]))
-        assert not bool(far.good.any())
+        assert not bool(refine_matches(RIG, images, self.LEFT, truth + torch.tensor([25.0, 0.0])).good.any())
         edge = torch.tensor([[-3.0, 160.0], [240.0, -3.0]], dtype=torch.float64)
-        beside = true_right(edge)[0]
-        assert not bool(refine_matches(RIG, images, edge, beside).good.any())
+        assert not bool(refine_matches(RIG, images, edge, true_right(edge)[0]).good.any())
         inside = self.LEFT[:1].expand(2, 2)
         assert not bool(
             refine_matches(RIG, images, inside, torch.tensor([[-3.0, 150.0], [479.0, 3.0]]).double()).good.any()

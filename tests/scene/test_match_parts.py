@@ -188,8 +188,7 @@ def test_still_is_what_lies_between_both_pixels(monkeypatch: pytest.MonkeyPatch)
 def test_refined_from_a_plane_at_a_known_range() -> None:
     """A textured plane far away through two equal pinholes side by side: the right image is the left one, moved."""
     camera = Camera.build(focal=(500, 500), center=(240, 160), size=(480, 320), model="pinhole")
-    shift = torch.tensor([-1.0, 0.0, 0.0]).double()
-    rig = Rig.pair(camera, camera, torch.eye(3).double(), shift)
+    rig = Rig.pair(camera, camera, torch.eye(3).double(), torch.tensor([-1.0, 0.0, 0.0]).double())
     picture = torch.nn.functional.avg_pool2d(noise(320, 480)[None, None], 5, 1, 2)[0, 0]
     left = torch.tensor([[250.0, 150.0], [120.0, 200.0], [5.0, 100.0], [300.0, 12.0], [8.0, 100.0]]).double()
     truth = left + torch.tensor([-4.0, 0.0]).double()

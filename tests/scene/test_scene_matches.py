@@ -99,8 +99,7 @@ def test_the_best_all_over_the_image_are_kept(matched: MatchedPair) -> None:
     few = scene_of(CAMERAS, [pair(1)], [found], most=100)
     assert len(few.features.names) == 100 == few.counts[0].used
     assert few.counts[0].thinned == len(found.pixels) - 100
-    spread = few.features.pixels[:, 0].std(0)
-    assert (spread > 0.8 * found.pixels[:, 0].std(0)).all()
+    assert (few.features.pixels[:, 0].std(0) > 0.8 * found.pixels[:, 0].std(0)).all()
 
 
 @pytest.mark.slow
@@ -108,15 +107,13 @@ def test_repeats_in_the_same_light_tell_less_than_they_count() -> None:
     """The errors of one thing are alike in pairs of one minute: they went for independent, and contradicted others."""
 
     def information(pairs: list[ImagePair], found: list[MatchedPair]) -> float:
-        features = scene_of(CAMERAS, pairs, found).features
-        return float((0.5 / features.covariance[:, 0, 1, 1]).sum())
+        return float((0.5 / scene_of(CAMERAS, pairs, found).features.covariance[:, 0, 1, 1]).sum())
 
     # Noise enough, so that another pair tells anything at all.
     pairs = [pair(1, noise=4.0), pair(2, noise=4.0)]
     found = [match_scene(CAMERAS, each) for each in pairs]
     one, two = information(pairs[:1], found[:1]), information(pairs, found)
-    stated = float((1.0 / found[0].covariance[:, 1, 1]).sum())
-    assert one < 0.75 * stated
+    assert one < 0.75 * float((1.0 / found[0].covariance[:, 1, 1]).sum())
     assert one < two < 1.7 * one
 
 

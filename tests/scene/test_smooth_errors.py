@@ -72,8 +72,7 @@ def test_matches_have_them() -> None:
     each = (SIGMA**2 * torch.eye(2, dtype=torch.float64)).expand(len(pixels), 2, 2)
     counts = PairCounts(name="a", matched=100, untextured=0, off_line=0, moved=0, thinned=0, used=100)
     own = MatchedPair(pixels, each, torch.ones(100, dtype=torch.float64), counts, RIG)
-    other = own._replace(counts=dataclasses.replace(counts, name="b"))
-    found = counted([own, other], SIZE).features
+    found = counted([own, own._replace(counts=dataclasses.replace(counts, name="b"))], SIZE).features
     for one, expected in zip(found.effects, effects_of(found.pixels), strict=True):
         assert one.name == expected.name
         assert torch.equal(one.shift, expected.shift)

@@ -58,8 +58,7 @@ def test_poses_cover_image_depth_and_directions(seed):
     size = torch.tensor([640.0, 480.0])
     assert bool((pixels.amin(0) < 0.12 * size).all())
     assert bool((pixels.amax(0) > 0.88 * size).all())
-    cells = (pixels / size * 4).long().clamp(0, 3)
-    assert len({tuple(cell) for cell in cells.tolist()}) == 16
+    assert len({tuple(cell) for cell in (pixels / size * 4).long().clamp(0, 3).tolist()}) == 16
     tilts = [tilt_of(pose, BOARD) for pose in poses]
     assert max(tilt for tilt, _ in tilts) > math.radians(35)
     assert min(tilt for tilt, _ in tilts) < math.radians(25)

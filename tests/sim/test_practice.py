@@ -70,8 +70,7 @@ def test_the_horizon_is_that_of_a_round_earth(small: PracticeSite) -> None:
     coast = Coast()
     dip = np.sqrt(2 * coast.sea / (EARTH / (1 - coast.refraction)))
     angle = np.radians(small.scene.heading_deg - 3.0)
-    far = 1e6 * np.array([[np.sin(angle), np.cos(angle), -np.tan(dip)]])
-    pixels, _ = small.eyes["left"].project(far)
+    pixels, _ = small.eyes["left"].project(1e6 * np.array([[np.sin(angle), np.cos(angle), -np.tan(dip)]]))
     column, row = pixels[0].round().astype(int)
     levels = (small.light("left")[row - 3 : row + 4, column] @ LUMA).round(1)
     steepest = row - 3 + int(np.abs(np.diff(levels)).argmax()) + 0.5
@@ -87,8 +86,7 @@ def test_a_facet_covers_its_area(small: PracticeSite) -> None:
     part = np.zeros((*camera.looks[window].shape[:2], 3))
     paint(part, plate, cut(camera, plate, window), Coast().haze._replace(length=1e12))
     share = part[..., 0] / WHITE[0]
-    corners = camera.project(plate.corners)[0]
-    x, y = corners.T
+    x, y = camera.project(plate.corners)[0].T
     area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
     assert share.sum() == pytest.approx(area, rel=1e-3)
     rows, columns = np.mgrid[window]

@@ -43,8 +43,7 @@ def camera_of(coefficients=(), size=(1280, 720), focal=1067.0, model="opencv12")
 
 def pose_of(vector, middle, board=BOARD):
     rotation = rotation_from_vector(torch.tensor(vector, dtype=torch.float64))
-    points = board_points(board)
-    return Pose(rotation, torch.tensor(middle, dtype=torch.float64) - rotation @ points.mean(0))
+    return Pose(rotation, torch.tensor(middle, dtype=torch.float64) - rotation @ board_points(board).mean(0))
 
 
 POSES = {
@@ -66,8 +65,7 @@ def cubic_saddle(image, start):
     keep = x**2 + y**2 <= 3.6**2
     x, y = x[keep], y[keep]
     powers = [(i, j) for i in range(4) for j in range(4 - i)]
-    design = torch.stack([x**i * y**j for i, j in powers], -1)
-    inverse = torch.linalg.pinv(design)
+    inverse = torch.linalg.pinv(torch.stack([x**i * y**j for i, j in powers], -1))
     rows, columns = (torch.arange(size, dtype=torch.float64) for size in image.shape)
     where = start.clone()
     for _ in range(8):
@@ -177,8 +175,7 @@ def test_inverse_is_interpolated_below_a_thousandth_of_a_pixel():
     camera = camera_of(LENS)
     normalized, valid = invert_window(camera, PixelRectangle(-7, 300, 160, 97))
     x, y = pixel_axes(PixelRectangle(-7, 300, 160, 97))
-    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
-    exact, valid_exact = camera.normalize(pixels.reshape(-1, 2))
+    exact, valid_exact = camera.normalize(torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2))
     assert valid.all()
     assert valid_exact.all()
     # Cubic interpolation over 8 px: 1e-5 px are 1e-8 in normalized coordinates.
@@ -222,8 +219,7 @@ def test_a_cut_board_is_drawn_as_far_as_it_is_seen():
     # The grid of the inverse lies elsewhere: gray levels may round differently.
     assert int((part.int() - whole.int()).abs().max()) <= 1
     assert not project_board(small, pose, BOARD)[1].all()
-    outside = pose_of((0, 0, 0), (5.0, 0.0, 1.0))
-    assert int(render_board(small, outside, BOARD, options).max()) == 0
+    assert int(render_board(small, pose_of((0, 0, 0), (5.0, 0.0, 1.0)), BOARD, options).max()) == 0
 
 
 def test_optics_and_sensor():

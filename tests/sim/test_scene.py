@@ -12,8 +12,7 @@ from kcal.sim.scene import DemoScene, demo_rig, mark_points, render_demo, scene_
 
 def test_rig_frame_is_turned_as_the_locator_turns_it():
     scene = DemoScene(heading_deg=127.0, pitch_deg=-3.0, roll_deg=5.0)
-    expected = enu_from_cam(127.0, -3.0, 5.0)
-    torch.testing.assert_close(scene.enu_from_rig, expected, rtol=0, atol=1e-14)
+    torch.testing.assert_close(scene.enu_from_rig, enu_from_cam(127.0, -3.0, 5.0), rtol=0, atol=1e-14)
 
 
 def test_targets_lie_where_they_are_said_to_lie():

@@ -83,8 +83,7 @@ def test_what_is_not_seen_says_so(lens: TruthLens) -> None:
 
 def test_the_image_ends_half_a_pixel_beyond_its_outer_centers(lens: TruthLens) -> None:
     width, height = lens.size
-    near = torch.tensor([[-0.49, -0.49], [width - 0.51, height - 0.51]]).double()
-    assert bool(lens.inside(near).all())
+    assert bool(lens.inside(torch.tensor([[-0.49, -0.49], [width - 0.51, height - 0.51]]).double()).all())
     out = torch.tensor([[-0.51, 9.0], [9.0, -0.51], [width - 0.49, 9.0], [9.0, height - 0.49]]).double()
     assert not bool(lens.inside(out).any())
 
@@ -181,8 +180,7 @@ def unit(values: list[list[float]]) -> torch.Tensor:
 def test_refraction_is_snells_law(angle: float, turn: float, ratio: float) -> None:
     normal = unit([[0.3, -0.2, 1.0]])
     across = torch.nn.functional.normalize(torch.linalg.cross(normal, unit([[math.cos(turn), math.sin(turn), 0.1]])))
-    light = math.cos(angle) * normal + math.sin(angle) * across
-    bent, passed = refract(light, normal, ratio)
+    bent, passed = refract(math.cos(angle) * normal + math.sin(angle) * across, normal, ratio)
     if ratio * math.sin(angle) > 1 + 1e-9:
         assert not bool(passed)
     elif ratio * math.sin(angle) < 1 - 1e-9:
@@ -382,8 +380,7 @@ def test_no_rotation_does_better() -> None:
 
 
 def test_what_a_folding_lens_does_not_see_is_nan() -> None:
-    folding = camera(coefficients=[-0.9, 0.1])
-    found = error_at_infinity(folding, camera())
+    found = error_at_infinity(camera(coefficients=[-0.9, 0.1]), camera())
     assert 0.1 < found.valid < 0.95
     assert float(torch.isnan(found.errors).any(-1).double().mean()) == pytest.approx(1 - found.valid)
 

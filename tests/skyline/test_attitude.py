@@ -61,8 +61,7 @@ def test_it_needs_no_rough_pose() -> None:
     assert sum(one.shares.values()) == pytest.approx(np.ones(3))
     assert one.shares["lens"].max() == 0.0  # a camera without a calibration is exact
     np.testing.assert_allclose(one.rotation @ one.rotation.T, np.eye(3), atol=1e-12)
-    off = (one.expected - one.border.row)[one.used]
-    assert np.sqrt(np.mean(off**2)) < 0.3
+    assert np.sqrt(np.mean((one.expected - one.border.row)[one.used] ** 2)) < 0.3
 
 
 def test_the_covariance_is_of_turns_about_east_north_up() -> None:
@@ -83,8 +82,7 @@ def test_larger_errors_are_stated_larger() -> None:
     rough = found(error=RasterError(sigma=4.0, offset=0.2, refraction_sigma=0.03))
     assert (rough.sigma_deg > 2.0 * as_it_is().sigma_deg).all()
     assert (rough.shares["raster"] > as_it_is().shares["raster"]).all()
-    far = found(place_sigma=(5.0, 5.0, 5.0))
-    assert far.sigma_deg[0] > 1.5 * as_it_is().sigma_deg[0]
+    assert found(place_sigma=(5.0, 5.0, 5.0)).sigma_deg[0] > 1.5 * as_it_is().sigma_deg[0]
 
 
 def test_trees_above_the_raster_are_left_out() -> None:
@@ -101,8 +99,7 @@ def test_trees_above_the_raster_are_left_out() -> None:
 
 
 def test_a_rough_heading_chooses() -> None:
-    near = found(heading=(45.0, 20.0))
-    assert near.heading_deg == pytest.approx(as_it_is().heading_deg, abs=1e-6)
+    assert found(heading=(45.0, 20.0)).heading_deg == pytest.approx(as_it_is().heading_deg, abs=1e-6)
     with pytest.raises(InputError, match=r"contradicts|equally|flat"):
         found(heading=(200.0, 20.0))
 

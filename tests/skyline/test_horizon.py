@@ -56,8 +56,7 @@ def test_no_cell_stands_above_the_horizon_and_some_cell_near_it() -> None:
     found = terrain_horizon(site.raster, site.place, table)
     off = elevation - np.interp(azimuth, table, found.elevation)
     assert off[far].max() < 3e-4  # a cell between two rays
-    some = table[50::400]
-    highest = [elevation[far & (np.abs(azimuth - one) < 5e-3)].max() for one in some]
+    highest = [elevation[far & (np.abs(azimuth - one) < 5e-3)].max() for one in table[50::400]]
     # Within 5 mrad there are several cells, but not one on the crest each time.
     assert np.median(np.abs(highest - found.elevation[50::400])) < 1e-3
 
@@ -74,8 +73,7 @@ def test_the_eye_on_the_earths_curve() -> None:
 
 def test_a_raster_that_ends_is_no_horizon() -> None:
     site = small_site()
-    small = heights()[200:280, 200:280]
-    found = terrain_horizon(raster_of(small), site.place, np.linspace(-3.0, 3.0, 100))
+    found = terrain_horizon(raster_of(heights()[200:280, 200:280]), site.place, np.linspace(-3.0, 3.0, 100))
     # Its ground rises to its end nearly everywhere; where it does not, what is beyond may be higher.
     assert found.known.mean() < 0.5
     assert found.doubtful[found.known].mean() > 0.9
@@ -108,8 +106,7 @@ def test_errors_of_heights_raise_a_horizon() -> None:
     site = small_site()
     azimuth = np.radians(np.linspace(0.0, 90.0, 60))
     exact = terrain_horizon(site.raster, site.place, azimuth)
-    error = RasterError(sigma=2.0, correlation=60.0)
-    stated = raised_horizon(exact, site.raster, site.place, error).raised
+    stated = raised_horizon(exact, site.raster, site.place, RasterError(sigma=2.0, correlation=60.0)).raised
     # Independent errors of cells, smoothed: many draws of whole rasters raise the horizon as much.
     random, rise = np.random.default_rng(1), []
     apart = CELL * np.hypot(*np.meshgrid(*[np.minimum(np.arange(480), 480 - np.arange(480))] * 2))
@@ -146,8 +143,7 @@ def test_cells_lower_a_crest_that_is_sharper(sharp: bool) -> None:
 
 def test_what_cells_lower_counts_as_an_error_of_each_crest() -> None:
     places = np.array([[0.0, 0.0, 0.0], [30.0, 40.0, 9.0]])
-    error = RasterError(sigma=3.0, correlation=50.0, offset=1.0)
-    found = error.heights(places, np.array([4.0, 0.0]))
+    found = RasterError(sigma=3.0, correlation=50.0, offset=1.0).heights(places, np.array([4.0, 0.0]))
     np.testing.assert_allclose(found, [[26.0, 1.0 + 15.0 / np.e], [1.0 + 15.0 / np.e, 10.0]], rtol=1e-12)
 
 

@@ -54,8 +54,7 @@ def solved(given: SkylineSource) -> RigResult:
 @pytest.mark.slow
 def test_a_rig_from_skylines_and_positions_alone() -> None:
     result = solved(source(0))
-    place = small_site().place
-    stations = result.stations(place)
+    stations = result.stations(small_site().place)
     for c, angles in enumerate((ANGLES, RIGHT)):
         stands = station_mounting(stations, c)
         sigma = stands.covariance.diagonal()[3:6].sqrt().rad2deg()

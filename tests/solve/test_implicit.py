@@ -24,8 +24,7 @@ def decay(x: Tensor, observed: Tensor) -> Tensor:
 
 
 def observations(*batch: int) -> Tensor:
-    generator = torch.Generator().manual_seed(2)
-    noise = torch.randn((*batch, len(TIMES)), generator=generator, dtype=torch.float64)
+    noise = torch.randn((*batch, len(TIMES)), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     return 2.0 * torch.exp(-1.3 * TIMES) + 0.5 + 0.2 * noise
 
 
@@ -59,8 +58,7 @@ class TestGradient:
         observed = observations()
         plain = LevenbergMarquardt(decay)(START, observed)
         assert not plain.x.requires_grad
-        carried = LevenbergMarquardt(decay)(START, observed.requires_grad_(True))
-        assert torch.equal(carried.x, plain.x)
+        assert torch.equal(LevenbergMarquardt(decay)(START, observed.requires_grad_(True)).x, plain.x)
 
     def test_none_where_it_did_not_converge(self) -> None:
         observed = observations().requires_grad_(True)
@@ -297,8 +295,7 @@ class Decays(SchurProblem[State]):
 def decays(noise: float, views: int = 4) -> tuple[Decays, State]:
     """The problem, and a state that a few steps bring near its minimum."""
     draw = torch.randn(views, 15, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
-    height = torch.arange(1.0, views + 1, dtype=torch.float64)[:, None]
-    y = height * torch.exp(-0.9 * Decays.x) + noise * draw
+    y = torch.arange(1.0, views + 1, dtype=torch.float64)[:, None] * torch.exp(-0.9 * Decays.x) + noise * draw
     return Decays(y), (torch.tensor([0.7]).double(), torch.ones(views, 1).double())
 
 
@@ -306,8 +303,7 @@ def decays(noise: float, views: int = 4) -> tuple[Decays, State]:
 def test_newton_ends_at_the_minimum_to_rounding(noise: float) -> None:
     """After a solver that stops early; and the systems are those of the Hessian there."""
     problem, start = decays(noise)
-    rough = LMOptions(max_iterations=4, tolerance=0.1)
-    (shared, local), solve = newton_minimum(problem, start, rough)
+    (shared, local), solve = newton_minimum(problem, start, LMOptions(max_iterations=4, tolerance=0.1))
     flat = torch.cat([shared, local.flatten()])
 
     def cost(x: Tensor) -> Tensor:

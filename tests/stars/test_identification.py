@@ -48,8 +48,7 @@ def test_centers_and_their_sigmas() -> None:
 
 def test_what_is_no_star_is_counted(night: Any) -> None:
     image = night.astype(np.float64)
-    generator = np.random.default_rng(5)
-    for row, column in generator.integers(30, 560, (12, 2)):
+    for row, column in np.random.default_rng(5).integers(30, 560, (12, 2)):
         image[row, column] += 4000.0  # hot pixels
     along = np.arange(200)
     for shift in range(-1, 2):
@@ -98,8 +97,7 @@ def test_stars_below_the_horizon_name_nothing(night: Any) -> None:
     found = name_stars(
         rendered(CAMERA, np.concatenate([pixels, phantoms]), both), CAMERA, SkyView(time=TIME, origin=PLACE)
     )
-    named = found.attitude.star[found.attitude.star >= 0]
-    assert bool((found.directions[named, 2] > 0.08).all())
+    assert bool((found.directions[found.attitude.star[found.attitude.star >= 0], 2] > 0.08).all())
 
 
 def test_eight_bits_name_stars_too(night: Any) -> None:

@@ -40,8 +40,7 @@ class TestSky:
         assert level.shape == noise.shape == (240, 320)
 
     def test_noise_of_the_sky(self) -> None:
-        draw = np.random.default_rng(1).normal(100.0, 4.0, (240, 320))
-        level, noise = _night_sky(draw, quantum=0.0)
+        level, noise = _night_sky(np.random.default_rng(1).normal(100.0, 4.0, (240, 320)), quantum=0.0)
         assert abs(level.mean() - 100.0) < 0.2
         assert noise.mean() == pytest.approx(4.0, rel=0.05)
         # Steps of gray levels are noise of their own.
@@ -119,8 +118,7 @@ def test_how_many_have_a_name() -> None:
 class TestFiles:
     def test_a_video_is_its_mean_frame(self, tmp_path: Path) -> None:
         frames = [np.full((32, 48), level, np.uint8) for level in (10, 20, 60)]
-        path = write_video(tmp_path / "a.mp4", iter(frames), 5, quality=0)
-        night = read_night(path)
+        night = read_night(write_video(tmp_path / "a.mp4", iter(frames), 5, quality=0))
         assert night.shape == (32, 48)
         assert np.abs(night - 30.0).max() < 1.0
         gray = np.arange(768, dtype=np.uint16).reshape(24, 32) * 80

@@ -149,8 +149,7 @@ def test_the_command(tmp_path: Path) -> None:
         assert done.exit_code == 0, done.output
         rig = load_rig(tmp_path / "rig.json")
         error = vector_from_rotation(rig.right_from_left_rotation @ (truth[1] @ truth[0].T).T)
-        known = rig.covariance.matrix[-6:-3, -6:-3]
-        assert float(error @ torch.linalg.solve(known, error)) < 16
+        assert float(error @ torch.linalg.solve(rig.covariance.matrix[-6:-3, -6:-3], error)) < 16
         assert float(error.norm()) < 1e-4
         assert (rig.mounting is not None) == bool(more)
         if more:

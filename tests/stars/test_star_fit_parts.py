@@ -10,11 +10,10 @@ import pytest
 import torch
 from scipy import stats
 
+from kcal import Camera, InputError
 from kcal.calibrate.problem.parameters import FreeParameters, GaussianPrior, GaussianTerm
 from kcal.calibrate.problem.state import BoardState
-from kcal.errors import InputError
 from kcal.gaussian import Gaussian, triangular
-from kcal.lens.camera import Camera
 from kcal.lens.information import CameraInformation
 from kcal.lens.pose import enu_from_cam, rotation_from_vector, seen_turned
 from kcal.lens.projection import FAR
@@ -221,8 +220,7 @@ class TestClocks:
 
     def test_images_that_are_not_on_the_earth_are_no_witness(self) -> None:
         assert self.turned(3600.0, on_earth=False) == []
-        pole = torch.from_numpy(pole_in_enu(PLACE.lat))
-        turn = rotation_from_vector(EARTH_RATE * 600.0 * pole)
+        turn = rotation_from_vector(EARTH_RATE * 600.0 * torch.from_numpy(pole_in_enu(PLACE.lat)))
         images = [
             image_of(torch.eye(3).double(), on_earth=False),
             image_of(TURN),
@@ -277,8 +275,7 @@ class TestPosterior:
         # Stars say `far`; the best of both is between.
         best = far / told**2 / (1 / told**2 + 1 / boards**2)
         change = torch.tensor([best], dtype=torch.float64)
-        stars = tensor([1 / told, (best - far) / told])
-        found = _agreement_with(stars, change, known, 50, 0.3)
+        found = _agreement_with(tensor([1 / told, (best - far) / told]), change, known, 50, 0.3)
         assert found.moved_px == pytest.approx(0.3 * best / told / math.sqrt(50))
         assert found.stated_px == pytest.approx(0.3 * boards / told / math.sqrt(50))
         if alone:
@@ -309,8 +306,7 @@ class TestPosterior:
         assert Agreement(9.0, 9, 1.1e-4, 0.1, 0.1).contradiction is None
 
     def test_noise_of_stars_is_that_of_those_used(self) -> None:
-        fields = [StarField(torch.zeros(3, 3), torch.zeros(3, 2), tensor(0.1, 0.1, 7.0))]
-        stars = StarViews.of(fields)
+        stars = StarViews.of([StarField(torch.zeros(3, 3), torch.zeros(3, 2), tensor(0.1, 0.1, 7.0))])
         stars = stars._replace(weights=stars.weights * tensor(1.0, 1.0, 0.0), variance=4.0)
         count, sigma = _star_noise(stars)
         assert count == 4
@@ -378,8 +374,7 @@ class TestProblem:
         problem = stars.problem(camera.model, FreeParameters((0, 1, 2, 3), (0, 0, 1, 2)))
         rows = lens_rows(problem, state, 3.0)
         out, whole = problem.off_poses(state), problem.rows(state)
-        joined = out.transpose(0, 1).flatten(1)
-        triangle = triangular(joined.T)[:-1]
+        triangle = triangular(out.transpose(0, 1).flatten(1).T)[:-1]
         torch.testing.assert_close(rows.T @ rows, triangle.T @ triangle / 9.0)
         turns, flat = whole[0, :3], whole[0, 3:]
         left = flat - flat @ turns.T @ torch.linalg.inv(turns @ turns.T) @ turns
@@ -453,8 +448,7 @@ class TestRoughLens:
         assert 0.0 < moved.max() < 20.0
         angles = np.arccos(np.clip(found[up][:50] @ found[up][:50].T, -1, 1))
         np.testing.assert_allclose(angles, np.arccos(np.clip(there[up][:50] @ there[up][:50].T, -1, 1)), atol=1e-7)
-        plain = SkyView(time=TIME)
-        np.testing.assert_array_equal(_directions(plain, CATALOG), celestial)
+        np.testing.assert_array_equal(_directions(SkyView(time=TIME), CATALOG), celestial)
 
     def test_a_rotation_follows_directions_at_another_time(self) -> None:
         turn = rotation_from_vector(tensor(1e-3, 2e-3, -1e-3)).numpy()
@@ -511,8 +505,7 @@ def test_a_view_needs_a_time_for_its_place() -> None:
     assert not SkyView(time=TIME).on_earth
     with pytest.raises(InputError, match="a place without a time"):
         SkyView(origin=PLACE)
-    known = SkyView(time=TIME, origin=PLACE, time_sigma=0.3, dut1=0.1)
-    assert known.clock_sigma == pytest.approx(0.3)
+    assert SkyView(time=TIME, origin=PLACE, time_sigma=0.3, dut1=0.1).clock_sigma == pytest.approx(0.3)
     assert SkyView(time_sigma=0.4).clock_sigma == pytest.approx(math.hypot(0.4, 0.9 / math.sqrt(3.0)))
     later = SkyView(time=TIME + datetime.timedelta(seconds=1), origin=PLACE, dut1=-1.0)
     # A second later with UT1 a second behind, the sky stands as it did.

@@ -56,8 +56,7 @@ class TestPoints:
         both = np.linalg.inv(np.linalg.inv(spread) + np.eye(2) / WIDTH**2)
         assert moments[0].tolist() == pytest.approx([both[0, 0], both[1, 1], both[0, 1]], abs=3e-4)
         assert bool(np.isnan(shift[1]).all())
-        far = _windowed(star(3.0, 0.0, spread, around)[None], around)[0]
-        assert bool(np.isnan(far).all())
+        assert bool(np.isnan(_windowed(star(3.0, 0.0, spread, around)[None], around)[0]).all())
 
     @pytest.mark.parametrize(("xx", "yy", "xy", "why"), [
         (0.84, 0.84, 0.0, ""), (0.86, 0.86, 0.0, "wider than a star"), (0.065, 0.065, 0.0, ""),
@@ -85,8 +84,7 @@ class TestPoints:
         shift[3, 0] = np.nan
         moments = WIDTH**2 * np.full((6, 3), [0.4, 0.4, 0.0])
         moments[5, 0] = WIDTH**2 * 0.1
-        saturated = np.array([False, False, False, False, True, True])
-        found = _reasons(boxes, 7, shift, moments, saturated)
+        found = _reasons(boxes, 7, shift, moments, np.array([False, False, False, False, True, True]))
         assert found.tolist() == ["", "", "hot pixels", "wider than a star", "saturated", "streaks"]
 
     def sky(self, height: float, x: float = 60.0, y: float = 50.0, noise: float = 2.0) -> NDArray[np.float64]:
@@ -143,8 +141,7 @@ class TestTurns:
         x, y = np.array([1.0, 0.0, 0.0]), np.array([math.cos(0.3), math.sin(0.3), 0.0])
         assert float(_angle(x, y)) == pytest.approx(0.3)
         assert float(_angle(x, -x)) == pytest.approx(math.pi)
-        middle = _middle(np.stack([x, y]))
-        assert middle.tolist() == pytest.approx([math.cos(0.15), math.sin(0.15), 0.0])
+        assert _middle(np.stack([x, y])).tolist() == pytest.approx([math.cos(0.15), math.sin(0.15), 0.0])
 
     def test_each_star_has_the_nearest_ray(self) -> None:
         """Within the reach; a star that two rays meet is that of the nearer one."""
@@ -200,8 +197,7 @@ class TestTables:
         }  # fmt: skip
         path = tmp_path / "table.npz"
         np.savez(path, allow_pickle=False, **good)
-        found = _table_on_disk(path)
-        assert found[2] == 4
+        assert _table_on_disk(path)[2] == 4
         np.savez(path, allow_pickle=False, **(good | change))
         assert _table_on_disk(path) is None
 

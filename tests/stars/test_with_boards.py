@@ -10,8 +10,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from kcal import Camera, InputError, load_camera
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal import CalibrationOptions, Camera, InputError, calibrate_camera, load_camera
 from kcal.calibrate.camera.result import CameraCalibrationResult
 from kcal.cli.main import app
 from kcal.io.images import write_png
@@ -74,8 +73,7 @@ def test_the_posterior_is_at_its_minimum(both: StarCamera) -> None:
     known = both.lens.camera.calibration
     rows = known.information.whole.rows
     slope = rows[:, :-1].T @ rows[:, -1]
-    half = known.information.half()
-    assert float((half @ slope).abs().max()) < 1e-4
+    assert float((known.information.half() @ slope).abs().max()) < 1e-4
 
 
 def test_another_focus_contradicts(boards: CameraCalibrationResult, night: Night) -> None:
@@ -99,8 +97,7 @@ def test_what_boards_must_say(boards: CameraCalibrationResult, both: StarCamera,
 
 
 def test_a_parametric_lens_is_refined_as_well(night: Night) -> None:
-    seen = capture(true_lens(), 10, 0.1, 1)
-    boards = calibrate_camera(seen, CalibrationOptions(model="opencv5"))
+    boards = calibrate_camera(capture(true_lens(), 10, 0.1, 1), CalibrationOptions(model="opencv5"))
     found = calibrate_by_stars(*night, SIZE, boards=boards)
     before, after = (error_at_infinity(one, true_lens()).rms for one in (boards.camera, found.lens.camera))
     assert after < before
@@ -116,8 +113,7 @@ def test_the_command(night: Night, tmp_path: Path) -> None:
         magnitude = 5.0 - 2.5 * torch.log10(torch.from_numpy(image.flux / image.flux.min()))
         assert view.time is not None
         write_png(folder / f"{view.time:%Y-%m-%dT%H%M%S}.png", rendered(true_lens(), image.pixels, magnitude.numpy()))
-    seen = capture(true_lens(), 10, 0.1, 1)
-    seen.save(tmp_path / "left.obs.json")
+    capture(true_lens(), 10, 0.1, 1).save(tmp_path / "left.obs.json")
     output = tmp_path / "left.camera.json"
     command = ["calibrate", str(tmp_path / "left.obs.json"), "--stars", str(folder), "--time", "name:Z", "--json"]
     command += ["--site", f"{PLACE.lat},{PLACE.lon},{PLACE.height}"]
@@ -188,8 +184,7 @@ def test_all_pairs_of_bright_stars_are_in_the_table(tmp_path: Path, monkeypatch:
         bright = min(150, table.stars)
         angle = np.arccos(np.clip(table.directions[:bright] @ table.directions[:bright].T, -1, 1))
         wanted = np.sort(angle[(angle < np.radians(limit_deg)) & ~np.eye(bright, dtype=bool)])
-        own = (table.pairs < bright).all(1)
-        np.testing.assert_allclose(np.sort(table.angle[own]), wanted, atol=1e-4)
+        np.testing.assert_allclose(np.sort(table.angle[(table.pairs < bright).all(1)]), wanted, atol=1e-4)
         assert np.all(np.diff(table.angle) >= 0)
     # Each pair both ways, one after the other; the brightest star is the first.
     assert np.array_equal(table.pairs[::2], table.pairs[1::2, ::-1])

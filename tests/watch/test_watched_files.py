@@ -315,8 +315,7 @@ def test_a_gap_makes_it_unsure_and_nothing_else() -> None:
 def test_one_wrong_look_is_doubted_and_three_are_believed() -> None:
     good = [row_of(60.0 * k, yaw_turn(0.0)) for k in range(30)]
     wrong = [row_of(1800.0 + 60.0 * k, yaw_turn(0.05)) for k in range(3)]
-    once = Watched(RIG, [*good, wrong[0]], MODEL)
-    told = once.turns_at(1800.0)
+    told = Watched(RIG, [*good, wrong[0]], MODEL).turns_at(1800.0)
     assert abs(float(told.mean[4])) < 1e-5
     # Nobody knows yet: the interval contains both.
     assert float(told.covariance[4, 4].sqrt()) > math.radians(0.045)
@@ -329,8 +328,7 @@ def test_one_wrong_look_is_doubted_and_three_are_believed() -> None:
 
 def test_what_came_after_a_jump_is_not_told_of_before() -> None:
     rows = [row_of(60.0 * k, yaw_turn(0.0 if k < 30 else 0.05)) for k in range(60)]
-    told = Watched(RIG, rows, MODEL).turns_at(60.0 * 20)
-    assert abs(math.degrees(float(told.mean[4]))) < 0.001
+    assert abs(math.degrees(float(Watched(RIG, rows, MODEL).turns_at(60.0 * 20).mean[4]))) < 0.001
 
 
 def test_swing_and_wind_are_learned() -> None:
@@ -376,8 +374,7 @@ def test_the_rig_of_a_moment() -> None:
     )
     assert not rig.mounting.covariance[:6].any()
     assert float(there.covariance.matrix[-5, -5]) == pytest.approx(float(expected.relative_covariance[1, 1]), rel=1e-6)
-    later = watched.rig_at(9000.0)
-    assert len(later.root) == len(there.root) == len(rig.root) + MORE_ERRORS
+    assert len(watched.rig_at(9000.0).root) == len(there.root) == len(rig.root) + MORE_ERRORS
     with pytest.raises(InputError, match="begins at 0"):
         watched.rig_at(-1.0)
 

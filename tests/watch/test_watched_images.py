@@ -52,8 +52,7 @@ def test_turns_of_both_cameras_are_found(then: tuple[FixedFeatures, FixedFeature
 
 @pytest.mark.slow
 def test_matches_between_the_cameras_tell_the_relative_turn(now: ImagePair) -> None:
-    matched = match_scene((RIG.left, RIG.right), now)
-    values, covariance = between_turn(RIG, matched)
+    values, covariance = between_turn(RIG, match_scene((RIG.left, RIG.right), now))
     off = (values - between_rows(RIG) @ TURNS)[:, None]
     assert float(off.T @ torch.linalg.solve(covariance, off)) < 20.5
     # The small baseline tells little of its own direction; pitch and roll it does.
@@ -118,8 +117,7 @@ def test_what_moves_is_learned_out_and_made_up_for(then: tuple[FixedFeatures, Fi
     # New ones stand where they would have been: seen with that turn, they agree with the old ones.
     assert float(after.variance[1, 1]) == pytest.approx(1e-10 * ((len(after.pixels) - kept) / len(after.pixels)) ** 2)
     added = after.at(torch.arange(len(after.pixels)) >= kept)
-    seen = seen_by(RIG.left, added, image, turn, "left")
-    assert float(seen.turn[1]) == pytest.approx(2e-4, abs=5e-6)
+    assert float(seen_by(RIG.left, added, image, turn, "left").turn[1]) == pytest.approx(2e-4, abs=5e-6)
 
 
 def test_features_seldom_found_are_learned_out(then: tuple[FixedFeatures, FixedFeatures]) -> None:

@@ -113,8 +113,7 @@ class TestResults:
             single = place / f"{name}.obs.json"
             assert kcal("detect", folder / name, *WHAT, "-o", single).exit_code == 0
             assert kcal("calibrate", single, "-o", place / f"{name}.camera.json", "--model", "opencv5").exit_code == 0
-            seen = Observations.load(place / "out" / f"{name}.obs.json")
-            assert seen == Observations.load(single)
+            assert Observations.load(place / "out" / f"{name}.obs.json") == Observations.load(single)
             ours = CameraFile.load(place / "out" / f"{name}.camera.json")
             other = CameraFile.load(place / f"{name}.camera.json")
             # Where memory lies decides the order of sums, and an iteration stops a little elsewhere for it.
@@ -384,8 +383,7 @@ def test_the_lines_of_finished_cameras_are_not_kept(folder, place):
 
 @pytest.mark.slow
 def test_dask(folder, first, place):
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
+    with pytest.importorskip("distributed").LocalCluster(
         n_workers=1, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
     ) as cluster:
         plain = [*WHAT, "--model", "opencv5"]

@@ -14,6 +14,7 @@ import torch
 from batch_crew import Here
 from calibrate_scenes import BOARD, camera, motions, observe, pixels_of
 
+from kcal import Board, DegenerateError, Observations, load_camera
 from kcal.calibrate.batch import results as module
 from kcal.calibrate.batch.jobs import (
     BatchOptions,
@@ -27,10 +28,6 @@ from kcal.calibrate.batch.jobs import (
 )
 from kcal.calibrate.batch.results import Results, calibrate_batch, run_tasks
 from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibrationResult, calibrate_camera
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
-from kcal.errors import DegenerateError
-from kcal.io.camera_file import load_camera
 
 NAMES = ("east", "west", "lone")
 

@@ -116,8 +116,7 @@ def test_where_no_board_was(box: tuple[float, float, float, float], place: str) 
 
 
 def test_a_corner_alone() -> None:
-    boxes = [(-1, -1, 195, 300), (-1, -1, 300, 195)]
-    (text,) = what_to_photograph(seen(*boxes * 5), camera(), TILTED)
+    (text,) = what_to_photograph(seen(*[(-1, -1, 195, 300), (-1, -1, 300, 195)] * 5), camera(), TILTED)
     assert text.startswith("show the board in the bottom right of the image")
     # A tenth of the image is not worth a picture.
     assert what_to_photograph(seen(*[(-1, -1, 275, 300)] * 10), camera(), TILTED) == ()
@@ -127,8 +126,7 @@ def hybrid(pupil1: float, focal: float = 300.0) -> tuple[Camera, Tensor]:
     model = LensModel(hybrid=HybridForm(shape=1.0, radius=1.0, modes=ZernikeModes()))
     parameters = torch.zeros(5 + model.size).double()
     parameters[:4] = torch.tensor([focal, focal, 149.5, 149.5])
-    made = Camera(parameters, size=(300, 300), model=model)
-    place = made.names.index("pupil1")
+    place = Camera(parameters, size=(300, 300), model=model).names.index("pupil1")
     parameters[place] = pupil1
     covariance = torch.zeros(len(parameters), len(parameters)).double()
     covariance[place, place] = 1e-4

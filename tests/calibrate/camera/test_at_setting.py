@@ -64,8 +64,7 @@ def test_a_setting_that_was_calibrated_is_that_camera() -> None:
 @pytest.mark.slow
 def test_beside_a_setting_nothing_jumps() -> None:
     """The general way, through a fit, gives the calibration as well: mean, covariance and entrance pupil."""
-    seen = observe(corner_pixels(8, 1, "opencv4", noise=0.1, seed=1))
-    first = calibrate_camera(seen).camera
+    first = calibrate_camera(observe(corner_pixels(8, 1, "opencv4", noise=0.1, seed=1))).camera
     cameras = [restated(first, focus=0.0)]
     for focus in (1.0, 2.0):
         moved = first.with_parameters(first.params * torch.where(torch.arange(len(first.params)) < 2, 1 + focus, 1.0))
@@ -162,8 +161,7 @@ def test_one_board_is_wrong_at_all_settings_alike() -> None:
             record = calibration_record(BoardRecord(columns=count, rows=6, square=0.05))
             made.calibration = CameraCalibration(information=known(focus), setting=stood, record=record)
             cameras.append(made)
-        found = camera_at_setting(cameras, {"focus": middle}).camera.calibration
-        return float(found.covariance[0, 0].sqrt())
+        return float(camera_at_setting(cameras, {"focus": middle}).camera.calibration.covariance[0, 0].sqrt())
 
     # A larger board makes the focal length smaller, whatever signs a decomposition has.
     assert float(_errors(known(0.0))[1][0, 0]) == pytest.approx(-1.0)

@@ -227,8 +227,7 @@ class TestFlips:
         start = dataclasses.replace(
             result, camera=truth, cam_from_board_rotation=poses[0], cam_from_board_translation=poses[1]
         )
-        best = minimize(problem, as_state(start))
-        reached = (2.0 * float(best.cost) / (100 * BOARD.corners)) ** 0.5
+        reached = (2.0 * float(minimize(problem, as_state(start)).cost) / (100 * BOARD.corners)) ** 0.5
         # A flip left standing raises the RMS of its own view by some percent; at 1e-3 of a view's cost a twin is not
         # worth the change.
         assert result.rms <= reached * (1 + 1e-4)
@@ -329,8 +328,7 @@ class TestWarnings:
         assert "has no ray" in folded[0]
 
     def test_steps_run_out(self) -> None:
-        pixels = corner_pixels(8, 2, noise=0.1)
-        result = solve(pixels, solver=LMOptions(max_iterations=1))
+        result = solve(corner_pixels(8, 2, noise=0.1), solver=LMOptions(max_iterations=1))
         assert result.status == SolverStatus.ITERATION_LIMIT
         assert any("iteration limit" in text for text in result.warnings)
 

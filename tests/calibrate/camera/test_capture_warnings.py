@@ -9,8 +9,7 @@ import pytest
 import torch
 from calibrate_scenes import observe
 
-from kcal import Board, Camera, InputError, Observations, View
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal import Board, CalibrationOptions, Camera, DegenerateError, InputError, Observations, View, calibrate_camera
 from kcal.calibrate.camera.warnings import (
     check_end,
     general_findings,
@@ -21,7 +20,6 @@ from kcal.calibrate.camera.warnings import (
 )
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.problem.state import LARGEST
-from kcal.errors import DegenerateError
 from kcal.finding import sentences
 from kcal.lens import rotation_from_vector
 from kcal.lens.uncertainty import paraxial_focal
@@ -39,8 +37,7 @@ MODES = ZernikeModes(radial=7, decentered=4, astigmatic=3, other=2)
 def fitted(views: int, hands: Hands | None) -> HybridFit:
     poses = sample_board_poses(CAMERA, BOARD, views, torch.Generator().manual_seed(4), fill=(0.3, 0.5))
     seen = moving_capture(CAMERA, poses, sigma=0.05, seed=5, hands=hands, board=BOARD).pixels
-    inside = CAMERA.inside(seen.nan_to_num(nan=-9.0))
-    pixels = torch.where(inside[..., None], seen, torch.nan)
+    pixels = torch.where(CAMERA.inside(seen.nan_to_num(nan=-9.0))[..., None], seen, torch.nan)
     return fit_hybrid(board_points(BOARD), pixels, CAMERA.size, options=FitOptions(modes=MODES, square=True))
 
 
@@ -152,11 +149,9 @@ def test_a_fit_that_did_not_reach_its_solution_is_refused() -> None:
 
 def test_a_sentence_about_pixels_needs_its_evidence() -> None:
     """That of the finished fit: 2.6 standard deviations are none."""
-    seen = unequal(1.0, CHECKERBOARD, aspect=1.01)
-    fit = calibrate_camera(seen).hybrid
+    fit = calibrate_camera(unequal(1.0, CHECKERBOARD, aspect=1.01)).hybrid
     assert not fit.square
     aspect, sigma = measured_aspect(fit)
     assert aspect == pytest.approx(1.01, abs=5.0 * sigma)
     assert "f_y / f_x = 1.01" in sentences(pixel_findings(fit))[0]
-    wider = dataclasses.replace(fit, half=(aspect - 1.0) / sigma / 2.6 * fit.half)
-    assert pixel_findings(wider) == []
+    assert pixel_findings(dataclasses.replace(fit, half=(aspect - 1.0) / sigma / 2.6 * fit.half)) == []

@@ -33,8 +33,7 @@ def test_a_model_that_holds_the_lens_finds_it() -> None:
     assert found.covered == 1.0
     pixels = truth.grid(9, 7).reshape(-1, 2)
     rays, _ = truth.unproject(pixels)
-    error = (found.camera.project(1e6 * rays)[0] - pixels).norm(dim=-1)
-    assert float(error.max()) <= found.largest * 1.5
+    assert float((found.camera.project(1e6 * rays)[0] - pixels).norm(dim=-1).max()) <= found.largest * 1.5
 
 
 @pytest.mark.slow
@@ -99,8 +98,7 @@ def test_the_true_model_predicts_to_the_noise() -> None:
 @pytest.mark.slow
 def test_the_board_is_the_measured_one() -> None:
     """An oblique bend of 1.5 mm: with the ordered board, or a warp that cannot follow it, held-out views show it."""
-    seen = capture(bend=1.5e-3)
-    result = compare_models(seen, ["hybrid", "opencv5"], groups="views", parts=2)
+    result = compare_models(capture(bend=1.5e-3), ["hybrid", "opencv5"], groups="views", parts=2)
     wanted = NOISE * math.sqrt(2.0 - 6.0 / len(BOARD.points))
     assert result.rms["hybrid"] < 1.3 * wanted
     assert result.rms["opencv5"] > 2 * wanted
@@ -172,8 +170,7 @@ def test_all_that_is_known_is_in_the_file(tmp_path: Path) -> None:
     result = calibrate_camera(seen, CalibrationOptions(model="opencv5", reject=OutlierRejection()))
     assert [corner.view for corner in result.rejected_corners] == [seen.names[2]]
 
-    path = result.save(tmp_path / "left.camera.json", name="left", source="left.obs.json")
-    file = CameraFile.load(path)
+    file = CameraFile.load(result.save(tmp_path / "left.camera.json", name="left", source="left.obs.json"))
     assert file.name == "left"
     assert file.camera().fingerprint == result.camera.fingerprint
     assert file.standard_deviations is not None
@@ -205,8 +202,7 @@ def test_how_the_board_deviates_is_kept_where_it_was_solved(tmp_path: Path, opti
     pixels = corner_pixels(8, 2)
     seen = observe(pixels + 0.1 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(3)))
     result = calibrate_camera(seen, CalibrationOptions(**options))
-    path = result.save(tmp_path / "a.camera.json")
-    record = CameraFile.load(path).calibration
+    record = CameraFile.load(result.save(tmp_path / "a.camera.json")).calibration
     if options == {"model": "opencv5"}:
         assert record.board_deviation is None
         return
@@ -266,8 +262,7 @@ def test_calibration(tmp_path, text, square, distance, shift):
     assert "board found in 8 of 8 images" in told
     assert f"{width:g} x {height:g} mm" in " ".join(told.split())
     assert ("looks the same turned by 180°" in told) == (board.pattern == "circles")
-    observations = Observations.load(seen)
-    assert observations.board == board
+    assert Observations.load(seen).board == board
     told = run("calibrate", seen, "-o", file)
     assert f"{width:g} x {height:g} mm" in " ".join(told.split())
     camera = load_camera(file)

@@ -8,9 +8,8 @@ import torch
 from calibrate_scenes import BOARD, SIZE, camera, motions, observe, pixels_of
 from lenses import FEW_MODES, hybrid_camera
 
-from kcal import Board, Camera, DegenerateError, Observations, View, detect
+from kcal import Board, CalibrationOptions, Camera, DegenerateError, Observations, View, calibrate_camera, detect
 from kcal.calibrate.camera.advice import check_directions, direction_share, reached, roll_findings
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 from kcal.calibrate.camera.checks import stray_corners
 from kcal.calibrate.camera.warnings import general_findings, outlier_findings
 from kcal.finding import sentences
@@ -51,8 +50,7 @@ def test_what_other_parameters_make_up_for_does_not_count() -> None:
     assert plain > 0.2
     free = list(range(8, len(lens.names)))
     slopes = project_components(FAR * rays.T, lens.params.detach(), lens.model, [0, 1, *free]).by_camera.flatten(1)
-    moved = change[0] * slopes[0] + change[1] * slopes[1]
-    change[free] = -torch.linalg.lstsq(slopes[2:].T, moved).solution
+    change[free] = -torch.linalg.lstsq(slopes[2:].T, change[0] * slopes[0] + change[1] * slopes[1]).solution
     made_up = direction_share(lens.params.detach(), lens.model, rays, change[:, None] * change)
     assert made_up < 0.1 * plain
 

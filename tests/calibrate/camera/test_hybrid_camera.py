@@ -21,8 +21,7 @@ NOISE = 0.1
 
 def truth(focal: float = 500.0) -> Camera:
     """Barrel distortion of opencv5, with square pixels."""
-    model = camera("opencv5", focal)
-    params = model.params.detach().clone()
+    params = camera("opencv5", focal).params.detach().clone()
     params[1] = params[0]
     return Camera(params, size=SIZE, model="opencv5")
 
@@ -128,10 +127,9 @@ def test_corners_weigh_by_their_covariances() -> None:
     generator = torch.Generator().manual_seed(9)
     blurred[::2] += 1.0 * torch.randn(blurred[::2].shape, generator=generator, dtype=torch.float64)
     sizes = [1.0 + NOISE**2 if i % 2 == 0 else NOISE**2 for i in range(len(blurred))]
-    views = observe(blurred).views
     with_size = tuple(
         view.model_copy(update={"covariance": tuple((size, 0.0, size) for _ in view.pixels)})
-        for view, size in zip(views, sizes, strict=True)
+        for view, size in zip(observe(blurred).views, sizes, strict=True)
     )
     weighted = calibrate_camera(seen.model_copy(update={"views": with_size}))
     plain = calibrate_camera(observe(blurred))

@@ -190,8 +190,7 @@ def test_a_known_camera_leaves_poses() -> None:
     found = calibrate_views(corners, BOARD.points, SIZE, CalibrationOptions(camera=camera("opencv4")))
     (gradient,) = torch.autograd.grad(found.cam_from_board_translation[0, 2], corners)
     # Corners that move apart by a share bring the board nearer by that share.
-    middle = corners.detach().mean((0, 1))
-    nearer = float((gradient * (corners.detach() - middle)).sum())
+    nearer = float((gradient * (corners.detach() - corners.detach().mean((0, 1)))).sum())
     assert nearer == pytest.approx(-float(POSES[1][0, 2]), rel=0.2)
 
 
@@ -214,8 +213,7 @@ def test_training_through_calibrations_finds_the_corners_bias() -> None:
     The reference is a calibration from clean corners with the same noise. The loss sees only where the cameras image
     three rays: six numbers for four unknowns.
     """
-    generator = torch.Generator().manual_seed(8)
-    features = torch.randn(*CORNERS.shape, generator=generator, dtype=torch.float64)
+    features = torch.randn(*CORNERS.shape, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
     features = features + 0.01 * (CORNERS - CORNERS.mean((0, 1)))  # a bias that grows outward bends the lens
     bias = torch.tensor([[0.6, -0.3], [0.2, 0.5]], dtype=torch.float64)
     options = CalibrationOptions(model="opencv4")

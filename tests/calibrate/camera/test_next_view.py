@@ -8,13 +8,10 @@ import torch
 from calibrate_scenes import observe
 from printed_boards import printed_views
 
+from kcal import Board, CalibrationOptions, Camera, calibrate_camera
 from kcal.calibrate.camera import advice as module
 from kcal.calibrate.camera.advice import far_sigma, next_view, possible_views
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.corners.board import Board
-from kcal.lens.calibration import CameraCalibration
-from kcal.lens.camera import Camera
-from kcal.lens.uncertainty import pixel_covariance
+from kcal.lens import CameraCalibration, pixel_covariance
 
 BOARD = Board(columns=8, rows=6, square=0.03)
 SIZE = (1280, 960)

@@ -49,8 +49,7 @@ def listed(result: CameraCalibrationResult) -> set[tuple[int, int]]:
 
 def test_normal_noise_loses_one_corner_in_a_hundred_calibrations() -> None:
     """A hundredth of a corner is expected beyond the limit in each; 7 of 300 or more have a chance of 3 %."""
-    generator = torch.Generator().manual_seed(0)
-    draws = torch.randn(300, 14, 42, 2, generator=generator, dtype=torch.float64)
+    draws = torch.randn(300, 14, 42, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     assert sum(int(corners_beyond(NOISE * draw).sum()) for draw in draws) < 7
 
 
@@ -213,8 +212,7 @@ def test_of_five_views_nobody_knows_which_is_wrong() -> None:
 def test_mirrored_views() -> None:
     pixels = corners()
     pixels[5, :, 0] = pixels[5, :, 0].max() + pixels[5, :, 0].min() - pixels[5, :, 0]
-    found = calibrate_camera(observe(pixels))
-    assert "mirrored" in reasons(found)["v05"]
+    assert "mirrored" in reasons(calibrate_camera(observe(pixels)))["v05"]
     # Where all are, nothing tells which: they are used, and `kcal report` says so.
     flipped = corners()
     flipped[..., 0] = SIZE[0] - 1 - flipped[..., 0]
@@ -315,8 +313,7 @@ def test_copies_change_nothing_and_are_named(seen: torch.Tensor, options: Calibr
             "v07": "it is a copy of v04",
             "v08": "it is a copy of v01",
         }
-        warning = result.warnings[-1]
-        assert warning.startswith(
+        assert result.warnings[-1].startswith(
             "3 of 9 views are copies of others (v06 of v01, v07 of v04, v08 of v01) and were left out"
         )
         assert result.warnings[:-1] == alone.warnings
@@ -481,10 +478,8 @@ def test_sigma_is_the_covariances(plain: list[CameraCalibrationResult]) -> None:
             sigma = result.sigma.get(name)
             if sigma is not None:
                 assert sigma**2 == pytest.approx(float(result.covariance[k, k]), rel=1e-12)
-        values = torch.linalg.eigvalsh(correlations(result.covariance))
-        assert float(values[0]) > -1e-9
-        skew = result.camera.names.index("skew")
-        assert bool((result.covariance[skew] == 0).all())
+        assert float(torch.linalg.eigvalsh(correlations(result.covariance))[0]) > -1e-9
+        assert bool((result.covariance[result.camera.names.index("skew")] == 0).all())
 
 
 def correlations(matrix: Tensor) -> Tensor:
@@ -514,5 +509,4 @@ def test_a_small_model_hardly_feels_the_weak_prior() -> None:
     for k, name in enumerate(without.camera.names):
         sigma = without.sigma.get(name)
         if sigma is not None:
-            change = float(with_prior.camera.params[k] - without.camera.params[k])
-            assert abs(change) < 0.5 * sigma, name
+            assert abs(float(with_prior.camera.params[k] - without.camera.params[k])) < 0.5 * sigma, name

@@ -10,16 +10,10 @@ import torch
 from calibrate_scenes import observe
 from torch import Tensor
 
+from kcal import Board, CalibrationOptions, Camera, InputError, Observations, calibrate_camera
 from kcal.calibrate.camera import each_view
 from kcal.calibrate.camera import one_camera as module
-from kcal.calibrate.camera.calibrate import calibrate_camera
-from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
-from kcal.lens.difference import camera_difference
-from kcal.lens.pose import rotation_from_vector
+from kcal.lens import camera_difference, rotation_from_vector
 from kcal.sim.captures import PrintedBoard, sample_board_poses, true_corners
 
 BOARD, VIEWS, SIZE = Board(columns=9, rows=6, square=0.03), 12, (1280, 960)
@@ -156,8 +150,7 @@ class TestMoves:
         params, true = result.camera.params.detach(), LENS.params.detach()
         assert float(sigma[2]) > 0.7 * center
         assert float(sigma[0]) > 0.7 * scale * float(params[0])
-        known = result.information
-        torch.testing.assert_close(known.covariance(), result.covariance, rtol=1e-3, atol=1e-9)
+        torch.testing.assert_close(result.information.covariance(), result.covariance, rtol=1e-3, atol=1e-9)
         expected = torch.cat([true[:2] * math.exp(float(middle[0])), true[2:4] + middle[1:]])
         assert float(((params[:4] - expected).abs() / sigma[:4]).max()) < 2.5
 
@@ -207,8 +200,7 @@ class TestNotAccused:
         assert result.by_view is None
 
     def test_too_few_views_to_tell(self) -> None:
-        seen = capture(cropped).subset(["00", "02", "04", "06", "01"])
-        assert math.isfinite(calibrate_camera(seen).rms)
+        assert math.isfinite(calibrate_camera(capture(cropped).subset(["00", "02", "04", "06", "01"])).rms)
 
     @pytest.mark.slow
     @pytest.mark.parametrize("name", ["st1_l", "sq1280"])
@@ -278,8 +270,7 @@ def test_amplitudes_from_quadratic_forms() -> None:
     K, g, own = K - mean @ K - K @ mean + mean @ K @ mean, g - mean @ g, torch.arange(3 * count) % 3 > 0
     expected = (g[own].square().sum() - K.diagonal()[own].sum()) / (math.sqrt(2.0) * K[own][:, own].norm())
     assert views.score([1, 2]) == pytest.approx(float(expected), rel=1e-9)
-    theta_slope = views.joint.slope(theta).flatten()
-    torch.testing.assert_close(theta_slope, g + K @ theta.flatten())
+    torch.testing.assert_close(views.joint.slope(theta).flatten(), g + K @ theta.flatten())
     most, nats = torch.tensor([0.0, 6.0, 6.0], dtype=torch.float64), []
     for k in range(13):
         wide = 2.0**-k * most.repeat(count)

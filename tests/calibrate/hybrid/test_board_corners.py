@@ -11,8 +11,7 @@ from hybrid_views import views_of
 from printed_boards import printed_points, printed_views
 from torch import Tensor
 
-from kcal import Board, Camera, InputError, Observations, load_camera
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Board, Boards, Camera, InputError, Observations, calibrate_camera, load_camera
 from kcal.calibrate.hybrid.board_modes import board_modes, turned_corners, turned_deviation
 from kcal.calibrate.hybrid.cameras_fit import CamerasFit, fit_cameras
 from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
@@ -20,7 +19,6 @@ from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_bo
 from kcal.calibrate.problem.board_problem import BoardProblem
 from kcal.calibrate.problem.state import BoardState
 from kcal.calibrate.rig.solve import without_repeated
-from kcal.calibrate.rig.sources import Boards
 from kcal.lens.zernike import ZernikeModes
 from kcal.solve.lm import LMOptions
 from kcal.solve.schur import Products

@@ -152,10 +152,8 @@ def test_turned_views_are_found(count: int) -> None:
     lens = torch.full((4,), 10.0, dtype=F64)
     prior = printed_prior(MODES, torch.full((4,), math.log(5e-4), dtype=F64))
     a = normal(28, seed=12) / prior.rows.diagonal()
-    found = find_turns(linear_views(a, turns, 20), BOARD_86, prior, lens, 1.0)
-    assert torch.equal(found, turns)
-    flat = find_turns(linear_views(0.0 * a, turns, 20), BOARD_86, prior, lens, 1.0)
-    assert not bool(flat.any())
+    assert torch.equal(find_turns(linear_views(a, turns, 20), BOARD_86, prior, lens, 1.0), turns)
+    assert not bool(find_turns(linear_views(0.0 * a, turns, 20), BOARD_86, prior, lens, 1.0).any())
 
 
 def test_views_are_turned_to_a_known_board() -> None:
@@ -246,8 +244,7 @@ def test_a_few_views_do_not_loosen_the_others() -> None:
     assert f"most in {int(bent.sum())} of 20 views" in text
     assert all(result.observations.names[i] in text for i in bent.nonzero()[:, 0].tolist())
     # Views are refitted as they were: a part of them keeps its own factors.
-    part = fit.only([3, 5])
-    torch.testing.assert_close(part.own_stillness, fit.own_stillness[[3, 5]])
+    torch.testing.assert_close(fit.only([3, 5]).own_stillness, fit.own_stillness[[3, 5]])
 
 
 def real(name: str) -> Observations:
@@ -317,8 +314,7 @@ def test_likelihood_of_hyperparameters() -> None:
     families = PriorFamilies(zero, zero, index, none, zero)
     x = torch.exp(TYPICAL.mean + 1.0)[index] * torch.randn(count, generator=generator, dtype=F64)
     A = 100.0 * torch.randn(300, count, generator=generator, dtype=F64)
-    target = A @ x + 0.1 * torch.randn(300, generator=generator, dtype=F64)
-    data = quadratic(A, target, zero)
+    data = quadratic(A, A @ x + 0.1 * torch.randn(300, generator=generator, dtype=F64), zero)
     h, variance = TYPICAL.mean, 0.02
     for _ in range(3):
         h, variance, *_ = maximize_evidence(standing(data), families, Amplitudes(h, variance), TYPICAL)
@@ -330,7 +326,6 @@ def test_likelihood_of_hyperparameters() -> None:
     torch.testing.assert_close(slope, (TYPICAL.mean - h) / TYPICAL.sd.square(), rtol=0, atol=0.05)
     at = np.append(h.numpy(), math.log(variance))
     value = negative_log_evidence(data, families, at)[0]
-    step = np.array([0.1, 0.0, 0.0])
-    there = negative_log_evidence(data, families, at + step)[0]
+    there = negative_log_evidence(data, families, at + np.array([0.1, 0.0, 0.0]))[0]
     predicted = 0.1 * float(slope[0]) + 0.005 * float(told[0, 0])
     assert abs(there - value - predicted) < 0.05

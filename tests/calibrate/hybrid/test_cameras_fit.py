@@ -138,8 +138,7 @@ def test_sigma_of_the_board() -> None:
         pixels = printed_views(camera(seed), BOARD, points, 13, seed, noise=NOISE, pupil=2e-3)
         fit = fit_hybrid(BOARD.points, pixels, SIZE, options=FitOptions(modes=MODES))
         shapes = fit.board_shapes.shapes.flatten(1).T
-        true = torch.linalg.lstsq(shapes, (points - BOARD.points).T.flatten()).solution
-        error = fit.state.board - true
+        error = fit.state.board - torch.linalg.lstsq(shapes, (points - BOARD.points).T.flatten()).solution
         inside.append((error.abs() < 1.96 * deviations(fit)).double().mean())
         half = fit.half[:, -28:]
         chi2.append(float(error @ torch.linalg.solve(half.T @ half, error)) / 28)

@@ -260,8 +260,7 @@ def value_of(loss: Loss) -> Callable[[np.ndarray], float]:
 
 
 def smallest(loss: Loss) -> np.ndarray:
-    places = np.linspace(-8.0, 4.0, 4001)
-    best = min(places, key=lambda x: loss(np.array([x, 0.0, 0.0]))[0])
+    best = min(np.linspace(-8.0, 4.0, 4001), key=lambda x: loss(np.array([x, 0.0, 0.0]))[0])
     return np.array([best, 0.0, 0.0])
 
 
@@ -331,8 +330,7 @@ def test_priors_are_of_the_unknowns_that_are_not_held() -> None:
     mean = torch.arange(count, dtype=torch.float64)
     precision = torch.full((count,), 4.0, dtype=torch.float64)
     precision[[1, -1]] = torch.inf
-    problem = views_of(board.points, modes, pixels).problem_under(MODEL, mean, precision)
-    (prior,) = problem.terms
+    (prior,) = views_of(board.points, modes, pixels).problem_under(MODEL, mean, precision).terms
     # cx is held, and the last mode of the board.
     assert prior.index.tolist() == [0, 3, *range(5, 5 + SIZE), 5 + SIZE]  # type: ignore[attr-defined]
     assert prior.mean.tolist() == [0.0, *mean[2:-1].tolist()]  # type: ignore[attr-defined]

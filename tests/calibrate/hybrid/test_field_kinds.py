@@ -57,8 +57,7 @@ def test_a_camera_is_found_with_each(kind: str) -> None:
 
 def test_priors_of_gaussian_units_fall_by_octaves() -> None:
     form = HybridForm(shape=0.5, radius=0.9, modes=GaussianModes(widths=(1.0, 0.5, 0.25)))
-    board = board_modes(BOARD.points)
-    families = prior_families(form, 800.0, board, SIZE, 0.6)
+    families = prior_families(form, 800.0, board_modes(BOARD.points), SIZE, 0.6)
     h = typical_hyperprior(form.modes).mean.clone()
     h[0], h[1] = math.log(1e-3), math.log(2.0)
     deviation = families.deviation(h)[6 : 6 + len(form.modes)]

@@ -14,7 +14,7 @@ import torch
 from printed_boards import shown
 from torch import Tensor
 
-from kcal.calibrate.camera.result import CalibrationOptions
+from kcal import Board, CalibrationOptions, Camera
 from kcal.calibrate.hybrid import fit as room
 from kcal.calibrate.hybrid.base_fit import fit_projection
 from kcal.calibrate.hybrid.board_modes import board_modes, turned
@@ -32,9 +32,7 @@ from kcal.calibrate.hybrid.fit import FitOptions, HybridFit, fit_hybrid
 from kcal.calibrate.hybrid.fitted_views import _cauchy_weights, moving_residuals
 from kcal.calibrate.hybrid.measured_board import MeasuredBoard, evidence, printed_board
 from kcal.calibrate.problem.state import HAND, HAND_SPREAD, Readout
-from kcal.corners.board import Board
 from kcal.gaussian import Gaussian, numbered
-from kcal.lens.camera import Camera
 from kcal.lens.information import BOARD_SLOT
 from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
@@ -199,15 +197,12 @@ class TestTypes:
         assert (lens.form.shape, lens.focal, lens.square) == (0.08, 801.0, True)
         wanted = typical_lens(lens.form, plain[0].fit.families, typical_hyperprior().mean, True)
         torch.testing.assert_close(lens.unknowns.sd, wanted.sd)
-        stretched = [*plain, self.camera(600.0, square=False)]
-        other = _begun_fleet(stretched)
+        other = _begun_fleet([*plain, self.camera(600.0, square=False)])
         assert (other.form.shape, other.focal, other.square) == (0.06, 601.0, False)
 
     def test_what_cameras_tell_of_each_other(self) -> None:
-        typical = self.camera(800.0)
-        lens = _begun_fleet([typical])
-        count = len(lens.unknowns.mean)
-        slots = numbered("lens", count)
+        lens = _begun_fleet([self.camera(800.0)])
+        slots = numbered("lens", len(lens.unknowns.mean))
         told = [Gaussian.independent(slots, lens.unknowns.mean + 0.1 * k * lens.unknowns.sd, 0.1 * lens.unknowns.sd)
                 for k in range(5)]  # fmt: skip
         cameras = [cast(CameraFit, SimpleNamespace(lens=one)) for one in told]

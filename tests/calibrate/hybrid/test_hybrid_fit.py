@@ -67,8 +67,7 @@ def test_pupil_and_board_come_back() -> None:
     assert abs(pupil - 3e-3) < 4.0 * sigma
     assert sigma < 1e-3
     measured, ordered = found.board_points, BOARD.points
-    bend = measured[0, 2] - measured[BOARD.columns - 1, 2]
-    assert float(bend) == pytest.approx(1.6e-3, abs=2e-4)
+    assert float(measured[0, 2] - measured[BOARD.columns - 1, 2]) == pytest.approx(1.6e-3, abs=2e-4)
     width = (measured[BOARD.columns - 1, 0] - measured[0, 0]) / (ordered[BOARD.columns - 1, 0] - ordered[0, 0])
     height = (measured[-1, 1] - measured[0, 1]) / (ordered[-1, 1] - ordered[0, 1])
     assert float(width / height) == pytest.approx(1.0015, abs=3e-4)
@@ -116,8 +115,7 @@ def test_evidence_is_found_where_a_trial_cannot_be_factorized() -> None:
     few = 1e2 * torch.randn(400, 5, generator=generator, dtype=torch.float64)
     rows = few @ torch.randn(5, len(wide), generator=generator, dtype=torch.float64) / wide
     truth = 30.0 * wide * torch.randn(len(wide), generator=generator, dtype=torch.float64)
-    noise = 0.3 * torch.randn(400, generator=generator, dtype=torch.float64)
-    data = quadratic(rows, noise, truth)
+    data = quadratic(rows, 0.3 * torch.randn(400, generator=generator, dtype=torch.float64), truth)
     prior = typical_hyperprior()
     mean, sd = prior.mean.numpy(), prior.sd.numpy()
     far = families.deviation(torch.from_numpy(mean + 5 * sd)) / 1e-3
@@ -171,8 +169,7 @@ def test_evidence_has_no_rounding_of_squares() -> None:
         typical_hyperprior().mean
     )
     at = torch.full((size,), 1e4, dtype=torch.float64) / rows.sum(1).std()
-    noise = 1e-3 * torch.randn(400, generator=generator, dtype=torch.float64)
-    data = quadratic(rows, noise, at)
+    data = quadratic(rows, 1e-3 * torch.randn(400, generator=generator, dtype=torch.float64), at)
     v = np.append(typical_hyperprior().mean.numpy(), 2.0 * math.log(1e-3))
     slope = negative_log_evidence(data, families, v)[1]
     for k in range(len(v)):

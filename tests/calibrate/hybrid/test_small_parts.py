@@ -67,8 +67,7 @@ class TestFleets:
         torch.testing.assert_close(found.mean, wanted[0], rtol=1e-6, atol=1e-9)
         torch.testing.assert_close(found.sd, wanted[1], rtol=1e-6, atol=1e-9)
         for k in range(5):
-            rest = torch.cat([values[:k], values[k + 1 :]])
-            wanted = by_hand(rest, mean)
+            wanted = by_hand(torch.cat([values[:k], values[k + 1 :]]), mean)
             torch.testing.assert_close(others[k].mean, wanted[0], rtol=1e-6, atol=1e-9)
             torch.testing.assert_close(others[k].sd, wanted[1], rtol=1e-6, atol=1e-9)
         # Four tell a type, and each of them nothing of the others; three tell none.
@@ -83,8 +82,7 @@ class TestFleets:
     @pytest.mark.parametrize("square", [True, False])
     def test_priors_of_a_known_lens(self, square: bool) -> None:
         """Its unknowns have no amplitudes; those of the board stay as they are."""
-        board = board_modes(BOARD.points)
-        usual = prior_families(FORM, 800.0, board, SIZE, 0.6, None if square else 1.02)
+        usual = prior_families(FORM, 800.0, board_modes(BOARD.points), SIZE, 0.6, None if square else 1.02)
         h = typical_hyperprior(MODES).mean
         lens = typical_lens(FORM, usual, h, square)
         count = 6 + len(MODES) + (not square)
@@ -113,8 +111,7 @@ class TestFleets:
         assert not bool(families.mean[6:].any())
         torch.testing.assert_close(unit[-28:], board.unit)
         assert families.amplitude[:4].tolist() == [-1] * 4
-        pupil = int(families.amplitude[4])
-        assert families.amplitude[-28:].tolist() == (pupil + 1 + board.family).tolist()
+        assert families.amplitude[-28:].tolist() == (int(families.amplitude[4]) + 1 + board.family).tolist()
         assert families.decay[-28:].tolist() == [-1] * 28
         # Of a measured board: as sure as it is.
         told = board._replace(unit=torch.full((28,), 0.3).double(), family=torch.full((28,), KNOWN))
@@ -184,8 +181,7 @@ class TestBoards:
         """At a place 0.2 m to the right and 0.1 m below its middle: shifts, tilts, a turn from x to y, the scale."""
         points = BOARD.points
         modes = undetermined_modes(points)
-        middle = points.mean(0)
-        x, y = (points[29] - middle)[:2].tolist()
+        x, y = (points[29] - points.mean(0))[:2].tolist()
         wanted = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, x], [0, 0, y], [-y, x, 0], [x, y, 0]]
         assert modes[:, :, 29].tolist() == [pytest.approx(row) for row in wanted]
         # None is among those that boards have.
@@ -215,8 +211,7 @@ class TestBoards:
 
     def test_what_all_others_say(self) -> None:
         said = [Gaussian.independent(("x",), tensor(float(k)), tensor(1.0)) for k in range(4)]
-        found = _but_one(said)
-        for k, one in enumerate(found):
+        for k, one in enumerate(_but_one(said)):
             assert float(one.mean) == pytest.approx((6.0 - k) / 3.0)
         assert _but_one(said[:1]) == [None]
 
@@ -371,8 +366,7 @@ def test_displacements() -> None:
     torch.testing.assert_close(board.displacements(PLATE.points), there)
     x, y = (PLATE.points[:, :2] - PLATE.points[:, :2].mean(0)).unbind(-1)
     u, v, w = there.unbind(-1)
-    left = [u.sum(), v.sum(), w.sum(), (x * w).sum(), (y * w).sum()]
-    assert max(abs(float(one)) for one in left) < 1e-12
+    assert max(abs(float(one)) for one in [u.sum(), v.sum(), w.sum(), (x * w).sum(), (y * w).sum()]) < 1e-12
     _, rest = plane_part()
     torch.testing.assert_close(w, rest[:, 2])
     stretch, shear = 0.5 * board.stretch.value, 0.5 * board.shear.value

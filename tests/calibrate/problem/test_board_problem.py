@@ -118,8 +118,7 @@ class TestRows:
             # The warp is applied alike whether it is free or not.
             torch.testing.assert_close(problem.rows(state), whole.rows(state)[..., wanted, :], rtol=0, atol=0)
             # What is not free does not move.
-            step = tuple(torch.ones_like(part) for part in zero_step(problem))
-            after = problem.retract(state, step)
+            after = problem.retract(state, tuple(torch.ones_like(part) for part in zero_step(problem)))
             held = [i for i in range(size) if i not in free]
             assert torch.equal(after.parameters[held], state.parameters[held])
             assert torch.equal(after.parameters[free], state.parameters[free] + 1.0)
@@ -198,8 +197,7 @@ class TestResiduals:
         assert bool(torch.isfinite(problem.rows(state)).all())
 
     def test_warp_is_the_deflection_at_the_middle(self) -> None:
-        board = Board(columns=5, rows=3, square=0.1)
-        shape = warp_modes(board.points)[:, 2]
+        shape = warp_modes(Board(columns=5, rows=3, square=0.1).points)[:, 2]
         middle = 1 * 5 + 2
         assert shape[:, middle].tolist() == [1.0, 1.0]
         for corner in (0, 4, 10, 14):

@@ -357,8 +357,7 @@ def test_a_known_camera_leaves_only_the_poses(views: int) -> None:
         def residuals(pose: Tensor, i: int = i) -> Tensor:
             turned = rotation_from_vector(pose[:3]) @ result.cam_from_board_rotation[i] @ BOARD.points.T
             points = turned + (result.cam_from_board_translation[i] + pose[3:])[:, None]
-            found = project_components(points, truth.params, truth.model).pixels
-            return (found.T - pixels[i]).flatten()
+            return (project_components(points, truth.params, truth.model).pixels.T - pixels[i]).flatten()
 
         zero = torch.zeros(6, dtype=torch.float64)
         jacobian = torch.autograd.functional.jacobian(residuals, zero)
@@ -369,8 +368,7 @@ def test_a_known_camera_leaves_only_the_poses(views: int) -> None:
 
 def test_a_known_camera_with_a_bent_board_and_a_freed_focal_length() -> None:
     truth = camera()
-    poses = motions(truth, 8, 5)
-    pixels = pixels_of(truth, poses, noise=0.05, seed=2)
+    pixels = pixels_of(truth, motions(truth, 8, 5), noise=0.05, seed=2)
     result = calibrate_camera(observe(pixels), CalibrationOptions(camera=truth, free=("fx", "fy"), board_warp=True))
     sigma = result.sigma["fx"]
     assert sigma is not None
@@ -406,8 +404,7 @@ def test_each_coefficient_shifts_a_place_at_the_reach_by_the_width(reach: float)
 
     sigma = sigmas()
     assert set(sigma) == set(model.names)
-    powers = {"k1": 2, "k4": 2, "k2": 4, "k5": 4, "k3": 6, "k6": 6}
-    for name, power in powers.items():
+    for name, power in {"k1": 2, "k4": 2, "k2": 4, "k5": 4, "k3": 6, "k6": 6}.items():
         assert sigma[name] == pytest.approx(0.3 / reach**power), name
     least = {"p1": 0, "p2": 0, "tau_x": 0, "tau_y": 0, "s1": 0, "s2": 2, "s3": 0, "s4": 2, "s5": 4, "s6": 4}
     for name, power in least.items():
@@ -433,5 +430,4 @@ def test_corners_are_whitened_by_their_own_covariance_and_the_rest() -> None:
         assert bool(found[1, 2].isnan().all())
         information = found[seen].mT @ found[seen]
         wanted = torch.linalg.inv(covariances[seen] + more * torch.eye(2))
-        scale = wanted.diagonal(dim1=-2, dim2=-1).mean()
-        torch.testing.assert_close(information, wanted / scale)
+        torch.testing.assert_close(information, wanted / wanted.diagonal(dim1=-2, dim2=-1).mean())

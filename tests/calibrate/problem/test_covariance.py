@@ -116,8 +116,7 @@ class TestWhatCannotBeComputed:
         assert bool(found.sigma.isinf().all())
 
     def test_the_calibration_is_returned_without_error_bars(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        poses = motions(camera(), 8, 3)
-        seen = observe(pixels_of(camera(), poses, noise=0.2))
+        seen = observe(pixels_of(camera(), motions(camera(), 8, 3), noise=0.2))
         linearize = BoardProblem.linearize
 
         def folded(problem: BoardProblem, state: BoardState) -> SchurLinearization:

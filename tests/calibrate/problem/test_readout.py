@@ -134,8 +134,7 @@ def test_motions_are_eliminated_like_poses(bends: bool) -> None:
     problem, state = moving_problem(True, bends)
     M = problem.local_size - POSE
     x = problem.unknowns(state)
-    off_all = problem.off_poses(state)
-    flat = off_all.transpose(0, 1).flatten(1)
+    flat = problem.off_poses(state).transpose(0, 1).flatten(1)
     matrix, scale = problem.linearize(state).information()
     reduced = matrix / scale[:, None] / scale
     torch.testing.assert_close(flat[:-1] @ flat[:-1].T, reduced, rtol=1e-6, atol=1e-6 * float(reduced.max()))
@@ -409,8 +408,7 @@ def test_unknowns_of_two_focal_lengths() -> None:
     # A robust weight of zero leaves a corner out; motions keep their prior.
     weights = torch.ones(4, BOARD.corners, dtype=F64)
     weights[0] = 0.0
-    moved = problem.with_weights(weights).corner_rows(state)
-    assert float(moved[0].abs().max()) == 0.0
+    assert float(problem.with_weights(weights).corner_rows(state)[0].abs().max()) == 0.0
     result = minimize(problem.with_weights(0.0 * weights), state, LMOptions(max_iterations=3))
     assert float(result.state[4].abs().max()) < 1e-9
 
@@ -449,8 +447,7 @@ def test_motion_is_looked_for_beside_a_fit_of_views_that_stand_still(rate: float
     estimate, _ = fit_base(views, MODES)
     rounds = run_rounds(views, estimate, cold=True, rough=True)
     distance = float(estimate.state.translation.norm(dim=-1).median())
-    readout = Readout(center=points.mean(0), distance=distance, size=SIZE)
-    assert motion_is_worth(rounds, readout) is worth
+    assert motion_is_worth(rounds, Readout(center=points.mean(0), distance=distance, size=SIZE)) is worth
 
 
 @pytest.mark.parametrize("columns", [False, True])

@@ -5,8 +5,7 @@ import torch
 from calibrate_scenes import camera, corner_pixels, motions, observe, pixels_of
 from torch import Tensor
 
-from kcal import Observations
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal import CalibrationOptions, Observations, calibrate_camera
 from kcal.calibrate.problem.parameters import FoldBarrier, GaussianPrior, ParameterConstraints, Term
 from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.pose import apply_twist
@@ -160,18 +159,15 @@ KINDS = ("huber", "cauchy", "tukey")
 def test_wrong_corners_hardly_matter(kind: str) -> None:
     """Two of a hundred corners are 15 px off: plain least squares is thrown off ten times as far."""
     truth = camera()
-    poses = motions(truth, 12, 5)
-    pixels = pixels_of(truth, poses, noise=0.1, seed=2)
+    pixels = pixels_of(truth, motions(truth, 12, 5), noise=0.1, seed=2)
     clean = calibrate_camera(observe(pixels), CalibrationOptions(model="opencv5")).camera.params
-    generator = torch.Generator().manual_seed(3)
-    wrong = torch.rand(pixels.shape[:2], generator=generator) < 0.02
+    wrong = torch.rand(pixels.shape[:2], generator=torch.Generator().manual_seed(3)) < 0.02
     pixels[wrong] += torch.where(pixels[wrong] < 460.0, 15.0, -15.0)  # within the image
     spoilt = calibrate_camera(observe(pixels), CalibrationOptions(model="opencv5")).camera.params
     result = calibrate_camera(
         observe(pixels), CalibrationOptions(model="opencv5", loss=RobustLoss(kind=kind, scale=0.4))
     )
-    robust = result.camera.params
-    assert float((robust - clean)[:4].norm()) < 0.1 * float((spoilt - clean)[:4].norm())
+    assert float((result.camera.params - clean)[:4].norm()) < 0.1 * float((spoilt - clean)[:4].norm())
     assert result.weighted_rms is not None
     assert result.weighted_rms < 0.5 * result.rms
 

@@ -55,8 +55,7 @@ def positions(off: Tensor | None = None, sigma: float = 0.02) -> tuple[MeasuredP
 
 def adjusted(sources: RigData) -> tuple[Adjustment, Tensor]:
     """A plain solution of everything."""
-    start = first_poses(sources, LMOptions()).starts[0]
-    work = Adjustment(sources, start, held(sources.cameras), 0.1)
+    work = Adjustment(sources, first_poses(sources, LMOptions()).starts[0], held(sources.cameras), 0.1)
     masks = ~work.none()
     work.solve(masks, LMOptions(residual_floor=1e-8))
     return work, masks

@@ -40,8 +40,7 @@ def features(shift: Tensor, amount: float, seed: int = 0, name: str = "shared") 
 
 def scattered(size: float) -> Tensor:
     """(COUNT, 2, 2) px: shifts that no pose makes."""
-    draw = torch.Generator().manual_seed(9)
-    return size * torch.randn(COUNT, 2, 2, generator=draw, dtype=torch.float64)
+    return size * torch.randn(COUNT, 2, 2, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
 
 
 def solved(data: Features) -> RigResult:

@@ -12,13 +12,12 @@ import torch
 from calibrate_scenes import calibration_record, observe
 from torch import Tensor
 
-from kcal import Board, Camera, InputError, Observations, RigOptions, calibrate_camera, calibrate_rig
+from kcal import Board, Boards, Camera, InputError, Observations, RigOptions, calibrate_camera, calibrate_rig
 from kcal.calibrate.hybrid.evidence import EvidenceLoss, view_data
 from kcal.calibrate.hybrid.families import Hyperprior, PriorFamilies
 from kcal.calibrate.rig.motion import CameraRows, RigRows, WithoutMotion
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.source import Context, PosedCamera, RigState, as_items
-from kcal.calibrate.rig.sources import Boards
 from kcal.calibrate.rig.unknowns import held
 from kcal.lens import CameraCalibration
 from kcal.lens.pose import Pose, rotation_from_vector, vector_from_rotation

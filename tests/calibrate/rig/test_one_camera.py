@@ -37,8 +37,7 @@ def views(seed: int, count: int = 10) -> Observations:
         angle = 2.0 * math.pi * i / count
         rotation = rotation_from_vector(tensor(0.5 * math.cos(angle), 0.5 * math.sin(angle), 0.2 * turn))
         place = tensor(5.0 * across - 2.5, 2.4 * down - 1.2, 6.0)
-        points = (BOARD.points - BOARD.points.mean(0)) @ rotation.T + place
-        shots.append(TRUE.project(points)[0])
+        shots.append(TRUE.project((BOARD.points - BOARD.points.mean(0)) @ rotation.T + place)[0])
     pixels = torch.stack(shots)
     inside = TRUE.inside(pixels)[..., None]
     return observe(
@@ -79,15 +78,13 @@ def located(found: RigResult, seed: int, noise: float) -> tuple[float, float, bo
 @pytest.mark.slow
 def test_ranges_have_the_errors_that_the_rig_says() -> None:
     """Refits with new errors of calibration, survey and marks scatter as far as sigma says: less than for two."""
-    seeds = range(8)
-    once = [rig((calibrated(seed), calibrated(seed)), survey(seed)) for seed in seeds]
+    once = [rig((calibrated(seed), calibrated(seed)), survey(seed)) for seed in range(8)]
     assert sum(located(found, seed, NOISE)[2] for seed, found in enumerate(once)) >= 7
     # Exact marks of the target: errors of the rig alone.
     errors = [located(found, 0, 0.0) for found in once]
     # 99 % of χ² of eight degrees of freedom.
     assert 1.34 < sum((error / sigma) ** 2 for error, sigma, _ in errors) < 21.95
-    twice = rig((calibrated(0), calibrated(100)), survey(0))
-    assert located(twice, 0, 0.0)[1] > 1.8 * errors[0][1]
+    assert located(rig((calibrated(0), calibrated(100)), survey(0)), 0, 0.0)[1] > 1.8 * errors[0][1]
 
 
 @pytest.mark.slow

@@ -10,8 +10,7 @@ from calibrate_scenes import observe
 from printed_boards import printed_points, seen_whole, shown
 from torch import Tensor
 
-from kcal import Board, Camera, Observations, RigOptions, calibrate_rig
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal import Board, CalibrationOptions, Camera, Observations, RigOptions, calibrate_camera, calibrate_rig
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.unknowns import gathered, joint_unknowns, less
 from kcal.lens import pixel_covariance, rotation_from_vector
@@ -179,8 +178,7 @@ def sharing(both: tuple[Camera, Camera], known: list[CameraInformation], board: 
 @pytest.mark.slow
 def test_one_board_is_shared_and_two_are_not() -> None:
     """By the evidence: both cameras saw this board; the same pattern printed again is another board."""
-    names = tuple(f"{i}.png" for i in range(14))
-    left, right = cameras("hybrid", names)
+    left, right = cameras("hybrid", tuple(f"{i}.png" for i in range(14)))
     informations = [known(left), known(right)]
     assert sharing((left, right), informations, BOARD) == (True, True)
     # A board that differs by 20 of its standard deviations.

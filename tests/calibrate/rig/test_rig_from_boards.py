@@ -55,8 +55,7 @@ def views(count: int, seed: int, *, board: Board = BOARD, noise: float = 0.0, no
     rotation, translation = poses(count, seed, board)
     left = pixels_of(LEFT, (rotation, translation), board=board, noise=noise, seed=noise_seed)
     turned = (ROTATION @ rotation, translation @ ROTATION.T + TRANSLATION)
-    right = pixels_of(RIGHT, turned, board=board, noise=noise, seed=noise_seed + 500)
-    return torch.stack([left, right], 1)
+    return torch.stack([left, pixels_of(RIGHT, turned, board=board, noise=noise, seed=noise_seed + 500)], 1)
 
 
 def names(count: int) -> list[tuple[str, str]]:
@@ -398,8 +397,7 @@ class TestRefusals:
 
     def test_nearly_equal_cameras_are_not_called_swapped_for_noise(self) -> None:
         pixels = views(5, 1, noise=0.3)
-        twin = Camera(RIGHT.params * (1 + 1e-5), size=SIZE)
-        assert solve(pixels, right=twin).left_out == ()
+        assert solve(pixels, right=Camera(RIGHT.params * (1 + 1e-5), size=SIZE)).left_out == ()
 
     def test_another_camera(self) -> None:
         other = Camera.build(focal=(1200, 600), center=(320, 240), size=SIZE)

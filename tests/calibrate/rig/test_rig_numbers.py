@@ -9,11 +9,10 @@ import torch
 from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, boards, features, landmarks, normal, see, spread_points, tensor
 from torch import Tensor
 
-from kcal import Baseline, DegenerateError, MeasuredPosition
+from kcal import Baseline, DegenerateError, Features, Landmarks, MeasuredPosition
 from kcal.calibrate.rig.assess import _advice, _Targets
 from kcal.calibrate.rig.contradictions import Part, _test
 from kcal.calibrate.rig.explanations import least_redundancy, redundancy, refuse_exact
-from kcal.calibrate.rig.marks import Features, Landmarks
 from kcal.calibrate.rig.motion import CameraRows, summed_products
 from kcal.calibrate.rig.problem import RigProblem, RigSolution, _of_item, least
 from kcal.calibrate.rig.source import (
@@ -128,10 +127,8 @@ class TestStatistics:
         test = _test(parts, (1,), (0, 1), nothing)
         assert (test.freedom, test.chi2, test.sigmas) == (1, pytest.approx(12.5), pytest.approx(math.sqrt(12.5)))
         # What is known beforehand counts among the others.
-        known = _test(parts, (1,), (0, 1), self.part(0.0, 0.5))
-        assert known.chi2 == pytest.approx(25.0 / (1.0 + 1.0 / 5.0))
-        alone = _test(parts, (1,), (1,), nothing)
-        assert alone == (0.0, 0, 0.0)
+        assert _test(parts, (1,), (0, 1), self.part(0.0, 0.5)).chi2 == pytest.approx(25.0 / (1.0 + 1.0 / 5.0))
+        assert _test(parts, (1,), (1,), nothing) == (0.0, 0, 0.0)
         # Two unknowns at once, by Wilson and Hilferty.
         rows = [torch.cat([torch.eye(2), -torch.tensor([[a], [b]])], 1).double() for a, b in ((0.0, 0.0), (3.0, 4.0))]
         two = [Part("", r.T @ r, 2, None) for r in rows]
@@ -236,10 +233,9 @@ class TestOpen:
     def test_what_matches_alone_leave_open_has_its_name(self) -> None:
         """Things of unknown range tell how two cameras stand but for the scale; without a frame, not where they are."""
         points = spread_points(8, 60.0, 900.0, 9)
-        pixels = torch.stack([see(points, c) for c in (0, 1)], 1)
         far = Features(
             names=tuple("abcdefgh"),
-            pixels=pixels,
+            pixels=torch.stack([see(points, c) for c in (0, 1)], 1),
             inverse_range=torch.zeros(8).double(),
             inverse_range_sigma=torch.full((8,), math.inf).double(),
         )
@@ -312,8 +308,7 @@ class TestTurns:
         slope = tensor([0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0])
         torch.testing.assert_close(found.pose_covariance[3:, 3:], 1e-10 * slope @ slope.T)
         for size, significant in ((3.9, False), (4.2, True)):
-            one = tensor(0.0, 0.0, 0.0, 0.0, size * math.sqrt(5e-10), 0.0)
-            told = drift_of_turns(rig, one, spread)
+            told = drift_of_turns(rig, tensor(0.0, 0.0, 0.0, 0.0, size * math.sqrt(5e-10), 0.0), spread)
             assert told.chi2 == pytest.approx(size**2, rel=1e-6)
             assert told.significant is significant
             assert told.cam_from_local is None

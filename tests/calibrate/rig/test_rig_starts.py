@@ -22,9 +22,8 @@ from rig_scenes import (
 )
 from torch import Tensor
 
-from kcal import Baseline, Camera, MeasuredPosition, Rig, RigData
+from kcal import Baseline, Camera, Features, MeasuredPosition, Rig, RigData, RigOptions, solve_rig
 from kcal.calibrate.rig.initial_poses import _baseline, _in_all_places, _into_frame, _level_starts, _starts
-from kcal.calibrate.rig.marks import Features
 from kcal.calibrate.rig.pairs import _median_rms, _view_rms, consensus, evenly, half_turn
 from kcal.calibrate.rig.resection import (
     _real_roots,
@@ -35,7 +34,6 @@ from kcal.calibrate.rig.resection import (
     distinct_poses,
     poses_from_three,
 )
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.calibrate.rig.source import Start
 from kcal.lens.pose import Pose, rotation_between, rotation_from_vector, vector_from_rotation
 from kcal.report.judge_rig import synchrony
@@ -69,8 +67,7 @@ class TestFewPoints:
         """(x - 1) (x + 2) (x² + 1), and (x - 3)² (x² + 4) with a little noise."""
         roots = _real_roots(tensor([2.0, 2.0, -2.0, 2.0, -4.0], [1.0, -6.0, 13.0, -24.0, 36.0 + 1e-6]))
         for found, wanted in zip(roots, ([-2.0, 1.0], [3.0, 3.0]), strict=True):
-            real = found[found.isfinite()]
-            assert sorted(real.tolist()) == pytest.approx(wanted, abs=1e-3)
+            assert sorted(found[found.isfinite()].tolist()) == pytest.approx(wanted, abs=1e-3)
 
     def test_subsets(self) -> None:
         assert _samples(4, 3).tolist() == [list(some) for some in itertools.combinations(range(4), 3)]
@@ -322,8 +319,7 @@ class TestPlaces:
         known = {0: Pose.at(ROTATION[0], CENTER[0]), 1: Pose.at(ROTATION[1], CENTER[0] + 2.0 * ROTATION[0, 0])}
         starts = _starts(known, [1])
         places = torch.stack([start.center[1] - CENTER[0] for start in starts])
-        wanted = 2.0 * torch.cat([ROTATION[0], -ROTATION[0]])
-        torch.testing.assert_close(places, wanted)
+        torch.testing.assert_close(places, 2.0 * torch.cat([ROTATION[0], -ROTATION[0]]))
         assert all(torch.allclose(start.center[0], CENTER[0]) for start in starts)
         assert len(_starts(known, [])) == 1
         assert len(_starts(known, [1, 0])) == 36
@@ -342,15 +338,13 @@ class TestPlaces:
         if count == 3:
             torch.testing.assert_close(start.rotation, ROTATION, rtol=0, atol=1e-4)
         line = torch.nn.functional.normalize(CENTER[1] - CENTER[0], dim=0)
-        across = torch.linalg.cross(line, tensor(0.0, 0.0, 1.0))
-        assert abs(float(down @ across)) < 0.02
+        assert abs(float(down @ torch.linalg.cross(line, tensor(0.0, 0.0, 1.0)))) < 0.02
         assert float(down[2]) < -0.99
         # It moves as a whole.
         torch.testing.assert_close(start.rotation @ start.rotation[0].T, own[0])
 
     def test_level_in_eight_headings(self) -> None:
-        some = data(features=features(cameras=3), positions=positions(0, 1, 2))
-        starts = _level_starts(some)
+        starts = _level_starts(data(features=features(cameras=3), positions=positions(0, 1, 2)))
         assert starts is not None
         assert len(starts) == 8
         headings = []
@@ -385,8 +379,7 @@ class TestPlaces:
                     seen / seen.norm(dim=-1, keepdim=True), rays_to(marks.points, c), rtol=0, atol=1e-5
                 )
         assert len(_in_all_places(data(2, landmarks=landmarks(count=4)), [start])) == 1
-        held = data(2, landmarks=marks, positions=positions(0, 1))
-        assert len(_in_all_places(held, [start])) == 1
+        assert len(_in_all_places(data(2, landmarks=marks, positions=positions(0, 1)), [start])) == 1
 
 
 class TestSynchrony:
@@ -439,7 +432,6 @@ class TestSynchrony:
         assert (nothing.pairs, nothing.ratio, nothing.shift, nothing.delay) == (0, 1.0, 0.0, None)
 
     def test_exact_and_still(self) -> None:
-        still = self.seen(1, 0.0).expand(9, 2, 20, 2)
-        found = synchrony(self.RIG, self.POINTS, still)
+        found = synchrony(self.RIG, self.POINTS, self.seen(1, 0.0).expand(9, 2, 20, 2))
         assert found.ratio < 0.1
         assert found.shift < 1e-6
