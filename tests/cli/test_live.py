@@ -1,10 +1,15 @@
-"""`kcal live`: tracks into files, stopped by SIGTERM and continued, and told what is wrong."""
+"""`kcal live`: tracks into files, stopped by SIGTERM and continued, and told what is wrong.
+
+`kcal live --detections -` ends by a signal while its input stays open.
+"""
 
 import contextlib
 import itertools
 import json
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,12 +18,14 @@ import torch
 from command_line import at_moment, rows_of
 from track_scenes import ORIGIN, seen_by, tracked_site
 from typer.testing import CliRunner
+from waiting import PATIENCE, wait_for
 
-from kcal import FileError, InputError, save_rig
+from kcal import FileError, InputError, Origin, save_rig
 from kcal.cli.main import app
 from kcal.lens.rig import Mounting
 from kcal.pipeline.stream import Stream
 from kcal.pipeline.tracks import TrackOptions
+from kcal.rig import planned_rig
 from scripts.shared.station_scenes import marks, ring
 
 
@@ -235,3 +242,29 @@ def test_placed_cameras_may_be_named_left_and_right(tmp_path: Path) -> None:
     rows = rows_of(tmp_path / "tracks.csv")
     assert rows
     assert float(rows[-1]["east_m"]) == pytest.approx(300.0, abs=15.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_while_it_waits_for_a_line(sent: signal.Signals, tmp_path: Path) -> None:
+    rig = planned_rig()
+    rig.mounting = Mounting(origin=Origin(lat=10.0, lon=20.0, height=3.0), heading_deg=30.0)
+    save_rig(rig, tmp_path / "rig.json")
+    command = [sys.executable, "-m", "kcal", "live", "rig.json", "--detections", "-", "-o", "tracks.csv"]
+    pipe = subprocess.PIPE
+    live = subprocess.Popen(command, cwd=tmp_path, stdin=pipe, stdout=pipe, stderr=pipe)
+    try:
+        live.stdin.write(b'{"time": 1.0, "left": [[960, 540]], "right": [[944, 540]]}\n')
+        live.stdin.flush()
+        written = tmp_path / "tracks.csv"
+        wait_for(lambda: written.exists() and written.stat().st_size > 0)
+        live.send_signal(sent)
+        # Its input stays open until it has ended.
+        live.wait(PATIENCE)
+        said = live.stderr.read().decode()
+    finally:
+        live.kill()
+        live.communicate()
+    assert "Fatal" not in said
+    assert "Traceback" not in said
+    assert live.returncode == 0

@@ -1,16 +1,23 @@
-"""Commands from plain functions: options, their help, files and values, and options of several words."""
+"""Commands from plain functions: options, their help, files and values, and options of several words.
 
+What commands take of the rooms: each name stands in the stub, which has no others, and is found where it says.
+"""
+
+import ast
 import dataclasses
 import json
+import sys
 from pathlib import Path
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from kcal.cli import kinds
+from kcal.cli import kinds, rooms
 from kcal.cli.options import Command, Kind, Only, Rare, Several, declared
+from kcal.doors import named_modules
 from kcal.errors import FileError, InputError
+from kcal.locate.marks import is_long
 from kcal.values import (
     WithSigma,
     distance,
@@ -152,3 +159,31 @@ def test_a_name_and_its_value() -> None:
     assert named(" fx = 1600 ", "--fix", "NAME=VALUE") == ("fx", "1600")
     with pytest.raises(InputError, match="--fix 'fx': write NAME=VALUE"):
         named("fx", "--fix", "NAME=VALUE")
+
+
+def test_the_stub_has_what_commands_use_and_nothing_else() -> None:
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in Path(rooms.__file__).parent.glob("*.py")]
+    parts = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
+    used = {part.attr for part in parts if isinstance(part.value, ast.Name) and part.value.id == "rooms"}
+    assert used == set(named_modules(rooms.__file__))
+
+
+def test_a_name_is_what_its_module_defines() -> None:
+    assert rooms.is_long is is_long
+    with pytest.raises(AttributeError, match="no attribute 'is_short'"):
+        _ = rooms.is_short  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("name", "library", "extra"),
+    [("Videos", "av", "video"), ("sender_to", "starlette", "mark"), ("LocalServer", "uvicorn", "mark")],
+)
+def test_a_library_that_is_missing_is_named_with_its_extra(
+    name: str, library: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for loaded in [one for one in sys.modules if one.partition(".")[0] == library]:
+        monkeypatch.setitem(sys.modules, loaded, None)
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, named_modules(rooms.__file__)[name], raising=False)
+    with pytest.raises(InputError, match=rf"this needs {library}\S*; install it with: pip install 'kcal\[{extra}\]'"):
+        getattr(rooms, name)

@@ -1,12 +1,19 @@
-"""Compiled tracks are those of the steps as they are: from one target to many, through births, occlusion and turns."""
+"""Compiled tracks are those of the steps as they are: from one target to many, through births, occlusion and turns.
 
+Modules of several inputs travel as ONNX.
+"""
+
+from pathlib import Path
 from unittest.mock import Mock
 
+import onnxruntime
 import pytest
 import torch
+from torch import Tensor, nn
 from track_scenes import pairs_of, seen_by, tracked_site
 
 from kcal import InputError, Localizer
+from kcal.lens import save_onnx
 from kcal.pipeline.imm_filter import no_beliefs
 from kcal.pipeline.tracks import Tracker, compiled_steps, track_steps
 from kcal.track import ClockPrior
@@ -52,3 +59,18 @@ def test_steps_that_cannot_be_compiled_are_an_error(monkeypatch: pytest.MonkeyPa
     nothing = no_beliefs(1, 0, 4, torch.device("cpu"))
     with pytest.raises(InputError, match="no compiler"):
         compiled_steps(track_steps(localize, 0.01), 2, nothing, None)
+
+
+class Parallax(nn.Module):
+    def forward(self, left: Tensor, right: Tensor) -> Tensor:
+        return left - 2.0 * right
+
+
+def test_onnx_of_two_inputs(tmp_path: Path) -> None:
+    left = torch.rand(5, 2, dtype=torch.float64)
+    with pytest.raises(InputError, match="the same N for every input"):
+        save_onnx(Parallax(), (left, left[:3]), tmp_path / "two.onnx")
+    session = onnxruntime.InferenceSession(save_onnx(Parallax(), (left[:2], left[:2]), tmp_path / "two.onnx"))
+    names = [entry.name for entry in session.get_inputs()]
+    (found,) = session.run(None, {names[0]: left.numpy(), names[1]: left.numpy() - 3.0})
+    assert torch.allclose(torch.from_numpy(found), 6.0 - left, rtol=0, atol=1e-14)

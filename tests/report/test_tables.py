@@ -6,9 +6,10 @@ import pytest
 import torch
 from locate_rigs import located_pairs, pinhole_rig, tensor
 
-from kcal import Board, Origin, Rig
+from kcal import Board, Camera, InputError, Origin, Rig
 from kcal.locate.budget import range_sigmas
 from kcal.locate.positions import position_errors
+from kcal.report.judge_rig import triangulated_sides
 from kcal.report.tables import diagonal_rows, position_rows, range_sigma_rows, truth_rows
 
 ORIGIN = Origin(lat=10.0, lon=20.0, height=0.0)
@@ -77,3 +78,17 @@ def test_diagonals_of_pairs_whose_ends_were_both_located() -> None:
     _, row = diagonal_rows(located, board)
     assert row[0] == "a"
     assert row[2:] == ["5.0000 m", "5.0060 m", "+6.0 mm"]
+
+
+@pytest.mark.parametrize("text", ["aprilgrid:3x2:0.3", "asymmetric:4x5", "5x4"])
+def test_sides_of_boards_of_unlike_distances(text):
+    """Each distance of neighbors counts as that of the first two points: alike on an exact board of any kind."""
+    board = Board.parse(text, "50mm")
+    camera = Camera.build(focal=(800, 800), center=(320, 240), size=(640, 480), model="pinhole")
+    rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-0.5, 0.0, 0.0]))
+    left, right = rig(board.points * 1.02 + torch.tensor([-0.2, 0.1, 2.0], dtype=torch.float64))[0].unbind(-2)
+    sides = triangulated_sides(rig, board.columns, board.rows, torch.stack([left, right])[None], board.points)
+    assert sides.mean == pytest.approx(1.02 * float((board.points[1] - board.points[0]).norm()), rel=1e-9)
+    assert sides.spread < 1e-9
+    with pytest.raises(InputError, match="points: shape"):
+        triangulated_sides(rig, board.columns, board.rows, torch.stack([left, right])[None], board.points[1:])

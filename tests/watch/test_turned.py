@@ -1,4 +1,7 @@
-"""The monitor of a rig's attitude: turns found to their sigmas, moving things named, statistics as stated."""
+"""The monitor of a rig's attitude: turns found to their sigmas, moving things named, statistics as stated.
+
+What a rig forgets by day.
+"""
 
 import dataclasses
 import math
@@ -12,7 +15,7 @@ from torch import Tensor
 from kcal import DegenerateError, Features, InputError, Landmarks, Rig
 from kcal.gaussian import half_of_covariance
 from kcal.lens import rotation_from_vector, vector_from_rotation
-from kcal.watch.turned import measure_drift
+from kcal.watch.turned import forgotten_yaw, measure_drift, parse_aging
 
 RELATIVE = ROTATION[1] @ ROTATION[0].T
 RIG = Rig.pair(CAMERAS[0], CAMERAS[1], RELATIVE, ROTATION[1] @ (CENTER[0] - CENTER[1]))
@@ -312,3 +315,15 @@ def test_turns_points_that_moved_and_noise_are_no_shift(gone: int, stated: float
     for seed in range(8):
         marks = dataclasses.replace(seen_later(seed, 0.0, gone), pixel_sigma=stated)
         assert measure_drift(pinhole_rig(1600.0, 10.0), features=marks).moved == ()
+
+
+def test_time_is_a_random_walk_and_temperature_is_not() -> None:
+    assert forgotten_yaw(hours=4, per_hour=0.001) == pytest.approx(0.002)
+    assert forgotten_yaw(kelvin=4, per_kelvin=0.001) == pytest.approx(0.004)
+    assert parse_aging("4h:0.001, 4K:0.001", "--aged") == pytest.approx(math.hypot(0.002, 0.004))
+
+
+@pytest.mark.parametrize("text", ["4h", "4:0.001", "4h:", "4h:-0.001", "4h:1e999", "x", "9h:0.1,4h:0.2"])
+def test_what_is_no_aging(text: str) -> None:
+    with pytest.raises(InputError, match=r"write hours|from 0 on"):
+        parse_aging(text, "--aged")

@@ -1,4 +1,7 @@
-"""Cameras for other programs: exact where the format holds the lens, else fitted with a true maximum."""
+"""Cameras for other programs: exact where the format holds the lens, else fitted with a true maximum.
+
+Export of several cameras into one file: one lens model for all, wide where others are far off, or a note.
+"""
 
 import subprocess
 from pathlib import Path
@@ -137,3 +140,53 @@ def test_maps_undistort(tmp_path: Path) -> None:
     with np.load(path) as maps:
         assert maps["map_x"].shape == (720, 1280)
         assert maps["camera_matrix"][0, 0] > 0
+
+
+def narrow(focal: float, model: str, *coefficients: float) -> Camera:
+    return Camera.build(
+        focal=(focal, focal), center=(319.5, 239.5), size=(640, 480), coefficients=coefficients, model=model
+    )
+
+
+# Nearest to these are radtan and equidistant, when each is fitted alone.
+NARROW = narrow(420, "opencv5", -0.02, 0.012, 0.001, 0.0, -0.001)
+WIDE = narrow(330, "opencv8", 0.4, 0.02, 0.001, 0.0, 0.01, 0.7, 0.08, 0.012)
+
+
+def rig(left: Camera, right: Camera) -> Rig:
+    return Rig.pair(left, right, torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))
+
+
+@pytest.mark.slow
+def test_a_wide_pair_becomes_omni_in_kalibr(tmp_path: Path) -> None:
+    assert export_cameras(NARROW, tmp_path / "one.yaml", format="kalibr").models == ("opencv4",)
+    done = export_cameras(rig(NARROW, WIDE), tmp_path / "chain.yaml", format="kalibr")
+    assert done.models == ("omni-radtan",) * 2
+    # 0.53 px as equidistant.
+    assert [misfit is not None and misfit.rms < 0.1 for misfit in done.misfits] == [True, True]
+    (note,) = done.notes
+    assert note.startswith("written as omni-radtan (camera 1 RMS 0.0")
+
+
+def test_a_camera_that_gets_worse_beside_another_is_told(tmp_path: Path) -> None:
+    exact = narrow(420, "fisheye4", 0.02, 0.0, 0.0, 0.0)
+    done = export_cameras(rig(exact, NARROW), tmp_path / "chain.yaml", format="kalibr")
+    assert done.models == ("fisheye4", "fisheye4")
+    (note,) = done.notes
+    assert note.startswith("camera 2: written as fisheye4 (RMS 0.19 px)")
+    assert note.endswith("it is opencv4 (RMS 0.0024 px)")
+
+
+def test_one_lens_model_for_all_of_a_file(tmp_path: Path) -> None:
+    milder = narrow(700, "opencv8", 0.1, 0.02, 0.0, 0.0, 0.0, 0.12, 0.0, 0.0)
+    assert len(set(export_cameras(rig(NARROW, milder), tmp_path / "chain.yaml", format="kalibr").models)) == 1
+    assert import_cameras(tmp_path / "chain.yaml").is_rig()
+
+
+def test_kinds_that_differ_are_told(tmp_path: Path) -> None:
+    left, right = narrow(500, "opencv4", -0.1, 0.01, 0.0, 0.0), narrow(300, "fisheye4", 0.01, 0.0, 0.0, 0.0)
+    done = export_cameras(rig(left, right), tmp_path / "chain.yaml", format="kalibr")
+    assert (done.models, done.misfits) == (("opencv4", "fisheye4"), (None, None))
+    (note,) = done.notes
+    assert "opencv4 and fisheye4" in note
+    assert export_cameras(rig(left, left), tmp_path / "same.yaml", format="kalibr").notes == ()
