@@ -68,14 +68,12 @@ def test_from_images_to_positions(images: Path, tmp_path: Path) -> None:
         assert known.record.rms == result.rms
         assert known.covariance is not None
         torch.testing.assert_close(known.covariance, result.covariance, rtol=1e-6, atol=1e-12)
-        points = torch.tensor([[0.0, 0.0, 5.0]], dtype=torch.float64)
-        spread = kcal.lens.pixel_covariance(cameras[side], points)
+        spread = kcal.lens.pixel_covariance(cameras[side], torch.tensor([[0.0, 0.0, 5.0]], dtype=torch.float64))
         assert 0 < float(spread[0].diagonal().sqrt().max()) < 1.0
 
     # Cameras to a rig; where it stands is measured.
     pairs = kcal.rig.pair_by_name(seen["left"].names, seen["right"].names)
-    solved = kcal.calibrate_rig(cameras["left"], cameras["right"], seen["left"], seen["right"], pairs)
-    rig = solved.stereo()
+    rig = kcal.calibrate_rig(cameras["left"], cameras["right"], seen["left"], seen["right"], pairs).stereo()
     rig.mounting = kcal.rig.Mounting(
         origin=ORIGIN, heading_deg=35.0, covariance=kcal.rig.mounting_covariance(origin_m=[0.02] * 3)
     )

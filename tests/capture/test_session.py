@@ -8,12 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from capture_frames import BOARD, images
-from command_line import Command
-from typer.testing import CliRunner
+from command_line import Command, ran
 
 from kcal import Board, FileError, InputError, Observations
 from kcal.capture.session import FIRST_VIEWS, CaptureOptions, CaptureSession, Shot, follow, shots
-from kcal.cli.main import app
 from kcal.corners.video import Frame
 from kcal.io.images import write_png
 
@@ -145,5 +143,4 @@ def test_command_line(tmp_path: Path, command: Command) -> None:
     assert "next: kcal calibrate" in done.out
     assert len(Observations.load(tmp_path / "x.obs.json").views) == 5
     assert len(list((tmp_path / "x.frames").iterdir())) == 5
-    failed = CliRunner().invoke(app, ["capture", str(tmp_path / "no"), *what, "-o", str(tmp_path / "y.obs.json")])
-    assert isinstance(failed.exception, FileError)
+    assert isinstance(ran("capture", tmp_path / "no", *what, "-o", tmp_path / "y.obs.json").exception, FileError)

@@ -39,8 +39,7 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CaptureSession:
         )
 
     def calibrate(seen: Any) -> SimpleNamespace:
-        turns = torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]).double()
-        rotation = rotation_from_vector(turns)
+        rotation = rotation_from_vector(torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]).double())
         rotation[2] = torch.nan
         return SimpleNamespace(
             camera=len(seen.views), hybrid=SimpleNamespace(sigma=1.0), cam_from_board_rotation=rotation, warnings=("w",)

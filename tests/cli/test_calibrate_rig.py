@@ -10,12 +10,10 @@ from unittest.mock import Mock
 
 import pytest
 import torch
-from command_line import Command
+from command_line import Command, invoked, ran
 from torch import Tensor
-from typer.testing import CliRunner
 
 from kcal import Board, Camera, DegenerateError, Observations, Rig, View
-from kcal.cli.main import app
 from kcal.io.camera_file import CameraFile, camera_to_file
 from kcal.io.rig_file import RigFile
 from kcal.lens.pose import rotation_from_vector
@@ -52,9 +50,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("calibrated")
     for side, word in enumerate(("left", "right")):
         observations(side, 6).save(made / f"{word}.obs.json")
-        words = ["calibrate", str(made / f"{word}.obs.json"), "-o", str(made / f"{word}.camera.json")]
-        outcome = CliRunner().invoke(app, words)
-        assert outcome.exit_code == 0, outcome.output
+        invoked(*["calibrate", str(made / f"{word}.obs.json"), "-o", str(made / f"{word}.camera.json")])
     return made
 
 
@@ -340,4 +336,4 @@ def test_missing_arguments_are_a_usage_error(
             camera_to_file(camera, name=name).save(Path(name))
         else:
             Path(name).write_text("{}")
-    assert CliRunner().invoke(app, arguments).exit_code == 2
+    assert ran(*arguments).exit_code == 2

@@ -19,11 +19,10 @@ import torch
 import typer
 from board_render import homography, render
 from calibrate_scenes import BOARD, camera, corner_pixels, observe, pixels_of
-from command_line import Command
+from command_line import Command, invoked, ran
 from locate_rigs import pinhole_rig
 from rich.console import Console
 from typer.main import get_command
-from typer.testing import CliRunner, Result
 
 from kcal import Board, Camera, FileError, Observations, View, load_rig, save_camera, save_rig
 from kcal.cli.console import err, out, print_styled, print_table, print_wrote, steps, warn
@@ -144,8 +143,7 @@ def test_an_interruption_says_what_was_kept(
     monkeypatch.chdir(tmp_path)
     Path("a.png").touch()
     monkeypatch.setattr("kcal.corners.images.expand_images", detect)
-    found = command("detect a.png --board 9x6 --square 25mm -o a.obs.json", code=130)
-    assert words in found.err.replace("\n", "")
+    assert words in command("detect a.png --board 9x6 --square 25mm -o a.obs.json", code=130).err.replace("\n", "")
 
 
 @pytest.mark.parametrize(
@@ -209,18 +207,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def kcal(*words: str) -> Result:
-    return CliRunner().invoke(app, list(words))
-
-
 def test_what_is_written_is_read(folder: Path) -> None:
     assert set(EXAMPLE) == set(SETTINGS)
     words = [word for key, value in EXAMPLE.items() for word in (f"--{key.replace('_', '-')}", str(value))]
-    assert kcal("init", *words).exit_code == 0
+    invoked("init", *words)
     assert read_settings(folder) == EXAMPLE
     with pytest.raises(FileError, match="kcal init --force"):
-        raise kcal("init").exception or AssertionError
-    assert kcal("init", "--force").exit_code == 0
+        raise ran("init").exception or AssertionError
+    invoked("init", "--force")
     assert read_settings(folder) == {}
 
 
@@ -245,7 +239,7 @@ def test_odd_texts_survive(folder: Path) -> None:
 def test_what_is_not_understood_is_refused(text: str, message: str, folder: Path) -> None:
     Path("kcal.toml").write_text(text)
     with pytest.raises(FileError, match=r"kcal\.toml: ") as refused:
-        raise kcal("budget").exception or AssertionError
+        raise ran("budget").exception or AssertionError
     assert message in str(refused.value)
 
 
@@ -268,20 +262,20 @@ def test_which_commands_take_a_setting() -> None:
 
 def test_commands_take_what_is_not_typed_and_say_so(folder: Path) -> None:
     Path("kcal.toml").write_text(toml_text({"board": "9x6", "square": "25mm", "pixel_sigma": 0.25}))
-    printed = kcal("board", "-o", "board.svg")
+    printed = ran("board", "-o", "board.svg")
     assert "board.svg: 9x6 inner corners, 25 mm squares" in printed.stdout
     assert "from kcal.toml: board 9x6, square 25mm" in printed.stderr
-    printed = kcal("board", "-o", "board.svg", "--board", "7x4")
+    printed = ran("board", "-o", "board.svg", "--board", "7x4")
     assert "board.svg: 7x4 inner corners, 25 mm squares" in printed.stdout
     assert "from kcal.toml: square 25mm\n" in printed.stderr
-    assert "0.354 px" in kcal("budget").stdout
+    assert "0.354 px" in ran("budget").stdout
 
 
 def test_the_file_of_a_folder_above_is_used_and_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("kcal.toml").write_text(toml_text({"board": "9x6", "square": "25mm", "source": "frames"}))
     Path("shots", "left").mkdir(parents=True)
     monkeypatch.chdir("shots/left")
-    printed = kcal("board", "-o", "board.svg")
+    printed = ran("board", "-o", "board.svg")
     assert "board.svg: 9x6 inner corners, 25 mm squares" in printed.stdout
     assert "from ../../kcal.toml: board 9x6, square 25mm\n" in printed.stderr
     # Folders are named from where the file is.
@@ -300,23 +294,23 @@ def test_the_file_of_a_folder_above_is_used_and_named(folder: Path, monkeypatch:
 
 
 def test_the_position_of_a_rig_goes_before_that_of_the_folder(folder: Path) -> None:
-    plain = kcal("locate", "rig.json", "points.csv").stdout
+    plain = ran("locate", "rig.json", "points.csv").stdout
     Path("kcal.toml").write_text(toml_text({"site": "1,2,3", "heading": 4.0}))
-    printed = kcal("locate", "rig.json", "points.csv")
+    printed = ran("locate", "rig.json", "points.csv")
     assert printed.stdout == plain
     assert "that in its file, not that in kcal.toml" in printed.stderr
-    assert kcal("locate", "rig.json", "points.csv", "--site", "1,2,3", "--heading", "4").stdout != plain
+    assert ran("locate", "rig.json", "points.csv", "--site", "1,2,3", "--heading", "4").stdout != plain
 
 
 def test_the_noise_of_marks_is_that_of_the_rig(folder: Path) -> None:
     assert load_rig("rig.json").calibration.pixel_sigma == 0.1
-    stated = kcal("locate", "rig.json", "points.csv")
+    stated = ran("locate", "rig.json", "points.csv")
     assert "noise of marks: 0.1 px, from the rig's file" in stated.stderr
-    assert stated.stdout == kcal("locate", "rig.json", "points.csv", "--pixel-sigma", "0.1").stdout
-    assert stated.stdout != kcal("locate", "rig.json", "points.csv", "--pixel-sigma", "0.3").stdout
-    assert "noise of marks: 0.3 px, assumed; --pixel-sigma states it" in kcal("budget").stderr
-    assert "noise of marks: 0.1 px, from the rig's file" in kcal("budget", "rig.json").stderr
-    assert "noise of marks 0.1 px along each axis" in kcal("show", "rig.json").stdout
+    assert stated.stdout == ran("locate", "rig.json", "points.csv", "--pixel-sigma", "0.1").stdout
+    assert stated.stdout != ran("locate", "rig.json", "points.csv", "--pixel-sigma", "0.3").stdout
+    assert "noise of marks: 0.3 px, assumed; --pixel-sigma states it" in ran("budget").stderr
+    assert "noise of marks: 0.1 px, from the rig's file" in ran("budget", "rig.json").stderr
+    assert "noise of marks 0.1 px along each axis" in ran("show", "rig.json").stdout
 
 
 @pytest.mark.parametrize("words", [["calibrate"], ["rig", "solve"], ["locate"], ["live"]])
@@ -325,18 +319,18 @@ def test_help_is_short_and_help_all_is_whole(words: list[str]) -> None:
     for word in words:
         command = command.commands[word]
     names = {param.opts[0]: param.hidden for param in command.params if param.opts[0].startswith("-")}
-    short, whole = kcal(*words, "--help").stdout, kcal(*words, "--help-all").stdout
+    short, whole = ran(*words, "--help").stdout, ran(*words, "--help-all").stdout
     assert sum(not hidden for hidden in names.values()) <= 12
     assert "--help-all shows" in short
     for name, hidden in names.items():
         row = rf"│ +(\* +)?(--\w+ +)?{name[:18]}"
         assert bool(re.search(row, short)) != hidden, name
         assert re.search(row, whole), name
-    assert kcal(*words, "--help").stdout == short
+    assert ran(*words, "--help").stdout == short
 
 
 def test_help_all_of_a_short_command_is_its_help() -> None:
-    assert kcal("show", "--help-all").stdout == kcal("show", "--help").stdout
+    assert ran("show", "--help-all").stdout == ran("show", "--help").stdout
 
 
 # Which large libraries a command loads: `--help` and `show` none, others only what they compute with.
@@ -444,18 +438,18 @@ def test_long_commands_do_not_wait_for_what_they_may_never_use(modules: str, wit
 
 def test_what_is_stored_is_what_is_computed(start_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("left.json", "plain.json", str(SAMPLE)):
-        stored = CliRunner().invoke(app, ["show", str(start_folder / name)]).output
+        stored = ran("show", start_folder / name).output
         with monkeypatch.context() as patch:
             patch.setattr("kcal.cli.show._as_written", lambda content: None)
-            assert CliRunner().invoke(app, ["show", str(start_folder / name)]).output == stored
+            assert ran("show", start_folder / name).output == stored
 
 
 def test_a_file_that_was_changed_is_computed_anew(start_folder: Path) -> None:
     content = json.loads((start_folder / "plain.json").read_text())
-    assert "focal length 800.000 px" in CliRunner().invoke(app, ["show", str(start_folder / "plain.json")]).output
+    assert "focal length 800.000 px" in ran("show", start_folder / "plain.json").output
     content["intrinsics"] |= {"fx": 900.0, "fy": 900.0}
     (start_folder / "changed.json").write_text(json.dumps(content))
-    assert "focal length 900.000 px" in CliRunner().invoke(app, ["show", str(start_folder / "changed.json")]).output
+    assert "focal length 900.000 px" in ran("show", start_folder / "changed.json").output
 
 
 # Data that are refused: each refusal names what is wrong, and ends with a command that can be pasted.

@@ -12,11 +12,11 @@ import pytest
 import torch
 from board_render import render
 from calibrate_scenes import BOARD, corner_pixels, observe
+from command_line import ran
 from interrupted import interrupt
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from kcal import CalibrationOptions, Observations, calibrate_camera, load_camera, load_rig, save_camera
-from kcal.cli.main import app
 
 # Ctrl-C: a command ends with one line and exit code 130, whatever it is doing, and leaves nothing torn behind.
 
@@ -34,8 +34,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("moment", ["import:kcal.cli.main", "import:torch", "lost:kcal.cli.main", "lost:torch"])
 def test_while_it_loads(moment: str, folder: Path) -> None:
-    said = interrupt(folder, moment, "export left.camera.json -o left.yaml")
-    assert said == "interrupted; nothing was written"
+    assert interrupt(folder, moment, "export left.camera.json -o left.yaml") == "interrupted; nothing was written"
 
 
 def test_while_a_table_is_located(folder: Path) -> None:
@@ -165,7 +164,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def capture(folder: Path, *options: str) -> Result:
     words = ["capture", "camera:0", "--board", "9x6", "--square", "25mm", "-o", str(folder / "left.obs.json"), *options]
-    return CliRunner().invoke(app, words, env={"COLUMNS": "40"})
+    return ran(*words, env={"COLUMNS": "40"})
 
 
 def test_the_address_is_on_one_line_and_opened(tmp_path: Path, opened: list[str]) -> None:
@@ -219,7 +218,7 @@ def test_an_interruption_before_all_has_started(
 
 
 def kcal(*words: object) -> tuple[int, str]:
-    found = CliRunner().invoke(app, [str(word) for word in words])
+    found = ran(*words)
     return found.exit_code, found.output
 
 

@@ -15,13 +15,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_line import at_moment, rows_of
+from command_line import at_moment, invoked, ran, rows_of
 from track_scenes import ORIGIN, seen_by, tracked_site
-from typer.testing import CliRunner
 from waiting import PATIENCE, wait_for
 
 from kcal import FileError, InputError, Origin, save_rig
-from kcal.cli.main import app
 from kcal.lens.rig import Mounting
 from kcal.pipeline.stream import Stream
 from kcal.pipeline.tracks import TrackOptions
@@ -50,9 +48,7 @@ def folder(tmp_path: Path) -> Path:
 
 def live(folder: Path, *options: str) -> str:
     command = ["live", str(folder / "rig.json"), "--detections", str(folder / "lines.jsonl")]
-    done = CliRunner().invoke(app, [*command, "-o", str(folder / "tracks.csv"), *options], catch_exceptions=False)
-    assert done.exit_code == 0
-    return done.output
+    return invoked(*command, "-o", folder / "tracks.csv", *options)
 
 
 def test_the_whole_job(folder: Path) -> None:
@@ -205,10 +201,9 @@ def test_stations_into_files(tmp_path: Path) -> None:
         file.write('{"cameras": {"tower 9": {"time": 1700000099, "boxes": []}}}\n')
     command = ["live", str(tmp_path / "towers.json"), "--detections", str(tmp_path / "lines.jsonl")]
     outputs = ["-o", str(tmp_path / "tracks.csv"), "-o", str(tmp_path / "tracks.geojsonl"), "--clock-sigma", "0.1"]
-    done = CliRunner().invoke(app, [*command, *outputs], catch_exceptions=False)
-    assert done.exit_code == 0
-    assert "with names of tower 1, tower 2, tower 3" in done.output
-    assert "tower 3's images are" in done.output
+    done = invoked(*command, *outputs)
+    assert "with names of tower 1, tower 2, tower 3" in done
+    assert "tower 3's images are" in done
     rows = rows_of(tmp_path / "tracks.csv")
     assert {row["name"] for row in rows} == {"track 1", "track 2"}
     assert {row["cameras"] for row in rows if row["sequence"] == "9"} == {"tower 2 tower 3"}
@@ -218,8 +213,7 @@ def test_stations_into_files(tmp_path: Path) -> None:
         assert found == pytest.approx(wanted, abs=15.0)
     # Azimuths count from the tower: the first one stands east of the target, at its own vertical.
     assert 180.0 < float(rows[-1]["azimuth_deg"]) < 360.0
-    refused = CliRunner().invoke(app, [*command, *outputs, "--heading", "3", "--site", "1,2,3"])
-    assert refused.exit_code == 2
+    assert ran(*command, *outputs, "--heading", "3", "--site", "1,2,3").exit_code == 2
 
 
 def test_placed_cameras_may_be_named_left_and_right(tmp_path: Path) -> None:
@@ -237,8 +231,7 @@ def test_placed_cameras_may_be_named_left_and_right(tmp_path: Path) -> None:
     ]
     (tmp_path / "lines.jsonl").write_text("\n".join(lines), encoding="utf-8")
     command = ["live", str(tmp_path / "towers.json"), "--detections", str(tmp_path / "lines.jsonl")]
-    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "tracks.csv")], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
+    invoked(*command, "-o", tmp_path / "tracks.csv")
     rows = rows_of(tmp_path / "tracks.csv")
     assert rows
     assert float(rows[-1]["east_m"]) == pytest.approx(300.0, abs=15.0)

@@ -12,16 +12,14 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
-from command_line import at_moment, rows_of, terminate
+from command_line import at_moment, invoked, ran, rows_of, terminate
 
 pytest.importorskip("av", reason="the extra `video` is not installed")
 from rtsp_server import RtspCamera
-from typer.testing import CliRunner
 from video_scenes import VELOCITY, bright_spots, film, places, small_rig, write_video
 from waiting import wait_for
 
 from kcal import FileError, InputError, Origin, Rig, save_rig
-from kcal.cli.main import app
 from kcal.threads import Handover
 
 FRAMES, LATE = 14, 0.03
@@ -50,9 +48,7 @@ def folder(scene: Path, tmp_path: Path) -> Path:
 def live(folder: Path, *options: str, detector: str = "video_scenes:bright_spots") -> str:
     videos = [str(folder / "left.mp4"), str(folder / "right.mp4")]
     command = ["live", str(folder / "rig.json"), *videos, "--detector", detector, "-o", str(folder / "tracks.csv")]
-    done = CliRunner().invoke(app, [*command, *options], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    return done.output
+    return invoked(*command, *options)
 
 
 @pytest.mark.slow
@@ -122,9 +118,7 @@ def test_three_videos_of_three_cameras(tmp_path: Path) -> None:
     command = ["live", str(tmp_path / "rig.json"), *videos, "--detector", "video_scenes:bright_spots"]
 
     def run() -> str:
-        done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "tracks.csv")], catch_exceptions=False)
-        assert done.exit_code == 0, done.output
-        return done.output
+        return invoked(*command, "-o", tmp_path / "tracks.csv")
 
     run()
     whole = (tmp_path / "tracks.csv").read_bytes()
@@ -218,8 +212,7 @@ def test_a_detector_that_does_not_work(folder: Path, detector: str, message: str
 @pytest.mark.parametrize("words", ["left --detector a:b", "left right", "", "left right --detector a:b --detections -"])
 def test_incomplete_commands(folder: Path, words: str) -> None:
     given = [str(folder / f"{word}.mp4") if word in ("left", "right") else word for word in words.split()]
-    done = CliRunner().invoke(app, ["live", str(folder / "rig.json"), *given, "-o", str(folder / "t.csv")])
-    assert done.exit_code == 2
+    assert ran("live", folder / "rig.json", *given, "-o", folder / "t.csv").exit_code == 2
 
 
 class Pairs(Handover[Any]):
@@ -249,7 +242,7 @@ def test_two_rtsp_streams_whose_newest_frames_are_taken(folder: Path, monkeypatc
     with cameras[0], cameras[1], at_moment(5):
         videos = [camera.address for camera in cameras]
         command = ["live", str(folder / "rig.json"), *videos, "--detector", f"{__name__}:slow_spots"]
-        done = CliRunner().invoke(app, [*command, "-o", str(folder / "tracks.csv")], catch_exceptions=False)
+        done = ran(*command, "-o", folder / "tracks.csv", catch_exceptions=False)
     assert done.exit_code == 0
     assert "5 moments, " in done.output
     assert "pairs dropped for lack of time" in done.output

@@ -11,13 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 from calibrate_scenes import camera, corner_pixels, motions, observe, pixels_of
-from command_line import Command, rows_of
-from typer.testing import CliRunner
+from command_line import Command, ran, rows_of
 
 import kcal.sim.scene
 from kcal import Board, Camera, DegenerateError, Observations, calibrate_camera
 from kcal.cli.console import more_views
-from kcal.cli.main import app
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
 from kcal.io.rig_file import RigFile
 from kcal.lens.calibration import CameraCalibration, LensSetting
@@ -199,9 +197,6 @@ def test_help_has_examples(run: Command, name: str) -> None:
 # What `kcal calibrate` says to people: focal lengths on the axis, and errors that end with the command to run.
 
 
-RUNNER = CliRunner()
-
-
 def write(path: Path, count: int, seed: int = 1, model: str = "opencv4") -> Path:
     observe(corner_pixels(count, seed, model, noise=0.1, seed=seed)).save(path)
     return path
@@ -209,7 +204,7 @@ def write(path: Path, count: int, seed: int = 1, model: str = "opencv4") -> Path
 
 def test_too_few_views_end_with_the_command_that_adds_some(tmp_path: Path) -> None:
     path = write(tmp_path / "my left.obs.json", 2)
-    result = RUNNER.invoke(app, ["calibrate", str(path), "-o", str(tmp_path / "left.camera.json")])
+    result = ran("calibrate", path, "-o", tmp_path / "left.camera.json")
     assert isinstance(result.exception, DegenerateError)
     text = str(result.exception)
     assert text.startswith("2 views of the board: at least 3")
@@ -230,7 +225,7 @@ def test_the_command_names_the_same_board() -> None:
 
 def test_one_of_several_cameras(tmp_path: Path) -> None:
     paths = [write(tmp_path / "a.obs.json", 8), write(tmp_path / "b.obs.json", 2)]
-    result = RUNNER.invoke(app, ["calibrate", *map(str, paths), "-o", str(tmp_path / "out")])
+    result = ran("calibrate", *paths, "-o", tmp_path / "out")
     assert "1 of 2 cameras failed: b" in str(result.exception)
     cure = f"To add views: kcal capture camera:0 --board 7x6 --square 50mm -o {paths[1]}"
     assert cure in result.output.replace("\n", "")
@@ -241,13 +236,13 @@ def test_one_of_several_cameras(tmp_path: Path) -> None:
 def test_focal_lengths_are_those_on_the_axis(tmp_path: Path) -> None:
     """Printed by calibrate, show and diff alike, and told to programs; fx of the file is another number."""
     path, file = write(tmp_path / "a.obs.json", 8), tmp_path / "a.camera.json"
-    told = json.loads(RUNNER.invoke(app, ["calibrate", str(path), "-o", str(file), "--json"]).stdout)
+    told = json.loads(ran("calibrate", path, "-o", file, "--json").stdout)
     saved = load_camera(file)
     found = paraxial_focal(saved)
     assert any(f"focal length {found}; principal point" in line for line in told["text"])
     assert abs(found.mean[0] - float(saved.focal[0])) > 0.1
-    assert f"focal length {found}, on its axis; fx and fy below" in RUNNER.invoke(app, ["show", str(file)]).output
-    assert RUNNER.invoke(app, ["diff", str(file), str(file)]).output.count(f"focal length {found}") == 2
+    assert f"focal length {found}, on its axis; fx and fy below" in ran("show", file).output
+    assert ran("diff", file, file).output.count(f"focal length {found}") == 2
     numbers = told["cameras"]["a"]
     assert numbers["focal_px"] == pytest.approx(found.value.tolist())
     assert numbers["focal_sigma_px"] == pytest.approx(found.sigma.tolist(), rel=1e-6)
@@ -255,9 +250,9 @@ def test_focal_lengths_are_those_on_the_axis(tmp_path: Path) -> None:
 
 def test_parametric_lenses_show_their_parameter(tmp_path: Path) -> None:
     path, file = write(tmp_path / "a.obs.json", 8), tmp_path / "a.camera.json"
-    RUNNER.invoke(app, ["calibrate", str(path), "-o", str(file), "--model", "opencv4"])
+    ran("calibrate", path, "-o", file, "--model", "opencv4")
     fx, fy = load_camera(file).focal.tolist()
-    text = RUNNER.invoke(app, ["show", str(file)]).output
+    text = ran("show", file).output
     match = re.search(r"focal length ([\d.]+) ± [\d.]+ px along rows, ([\d.]+) ± [\d.]+ px along columns\n", text)
     assert match is not None
     # Rounded to two digits of sigma.
@@ -290,15 +285,14 @@ def test_several_settings_in_one_call(tmp_path: Path, command: Command) -> None:
     found = [load_camera(tmp_path / "out" / f"{name}.camera.json").calibration for name in ("near", "far")]
     values = [one and one.setting and one.setting.values for one in found]
     assert values == [{"focus": 1.0, "zoom": 12.0}, {"focus": 2.5, "zoom": 12.0}]
-    assert "setting focus=2.5 zoom=12" in RUNNER.invoke(app, ["show", str(tmp_path / "out/far.camera.json")]).output
+    assert "setting focus=2.5 zoom=12" in ran("show", tmp_path / "out/far.camera.json").output
     for option, message in (
         ("focus=1,2,3", "3 numbers for 2 cameras"),
         ("focus", "write NAME=NUMBER"),
         ("focus=a", "--setting focus 'a': write NAME=NUMBER"),
     ):
-        assert message in str(RUNNER.invoke(app, [*words, "--setting", option]).exception)
-    twice = RUNNER.invoke(app, [*words, "--setting", "focus=1", "--setting", "focus=2"])
-    assert "focus is stated twice" in str(twice.exception)
+        assert message in str(ran(*words, "--setting", option).exception)
+    assert "focus is stated twice" in str(ran(*words, "--setting", "focus=1", "--setting", "focus=2").exception)
 
 
 def test_interpolate(tmp_path: Path, command: Command) -> None:
@@ -312,16 +306,16 @@ def test_interpolate(tmp_path: Path, command: Command) -> None:
     assert known is not None
     assert known.setting is not None
     assert (known.name, known.setting.interpolated_from) == ("now", tuple(paths))
-    assert f"setting focus=1.5, interpolated from {paths[0]}, " in RUNNER.invoke(app, ["show", str(made)]).output
-    told = json.loads(RUNNER.invoke(app, [*words, "--json"]).stdout)
+    assert f"setting focus=1.5, interpolated from {paths[0]}, " in ran("show", made).output
+    told = json.loads(ran(*words, "--json").stdout)
     assert told["sigma_px"]["setting"] == 0.0 < told["sigma_px"]["interpolation"]
     assert sum(row["weight"] for row in told["cameras"]) == pytest.approx(1.0)
-    same = RUNNER.invoke(app, ["interpolate", *paths, "--setting", "focus=2", "-o", str(made)])
+    same = ran("interpolate", *paths, "--setting", "focus=2", "-o", made)
     assert "focus=2, calibrated: points at infinity ± " in same.output
     assert load_camera(made).focal.tolist() == [504.0, 504.0]
     made.unlink()
-    beyond = RUNNER.invoke(app, ["interpolate", *paths, "--setting", "focus=3.5", "-o", str(made)])
+    beyond = ran("interpolate", *paths, "--setting", "focus=3.5", "-o", made)
     assert "focus=3.5 is outside the calibrated focus of 0 to 3" in str(beyond.exception)
     for setting, message in (("focus=1,2", "--setting focus '1,2': write VALUE±SIGMA"), ("focus=1", "is stated twice")):
-        assert message in str(RUNNER.invoke(app, [*words, "--setting", setting]).exception)
+        assert message in str(ran(*words, "--setting", setting).exception)
     assert not made.exists()

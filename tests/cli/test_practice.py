@@ -9,13 +9,12 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import ran
 
 import kcal.cli.demo_practice
 import kcal.io.images
 from kcal import FileError
 from kcal.cli.demo_practice import STEPS, TRUTH, next_step, night_name, practice_score, practice_site
-from kcal.cli.main import app
 from kcal.mark.items import Add, Mark, Put, Side
 from kcal.mark.session import Session
 from kcal.report.practice_score import score_positions, score_tracks
@@ -153,8 +152,7 @@ def test_without_the_extra_for_videos_the_rest_is_made(
 
 
 def test_options_that_exclude_each_other(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["demo", "--practice", str(tmp_path / "a"), "--score", str(tmp_path / "a")])
-    assert done.exit_code == 2
+    assert ran("demo", "--practice", tmp_path / "a", "--score", tmp_path / "a").exit_code == 2
     assert not (tmp_path / "a").exists()
 
 
@@ -171,9 +169,9 @@ def test_the_walk_of_a_stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             continue
         for command in step.commands:
             assert command in readme
-            done = CliRunner().invoke(app, shlex.split(command)[1:], catch_exceptions=False)
+            done = ran(*shlex.split(command)[1:], catch_exceptions=False)
             assert done.exit_code == 0, done.output
-    done = CliRunner().invoke(app, ["demo", "--score", "."], catch_exceptions=False)
+    done = ran("demo", "--score", ".", catch_exceptions=False)
     assert "All steps are done." in done.output
     truth = json.loads(TRUTH.read_text())
     scores = score_positions(Path("positions.geojson"), truth).records

@@ -12,9 +12,8 @@ import pytest
 import torch
 from browser import chromium_page, needs_browser
 from calibrate_scenes import corner_pixels, observe
-from command_line import invoked, rows_of
+from command_line import invoked, ran, rows_of
 from locate_rigs import pinhole_rig
-from typer.testing import CliRunner
 
 from kcal import InputError, save_rig
 from kcal.cli.main import app
@@ -25,7 +24,7 @@ from scripts.shared.station_scenes import ring
 
 
 def kcal(*words: object) -> tuple[int, str]:
-    found = CliRunner().invoke(app, [str(word) for word in words])
+    found = ran(*words)
     return found.exit_code, found.stdout
 
 
@@ -74,9 +73,7 @@ def test_calibration_ends_with_3_where_what_is_required_is_not_met(folder: Path)
     assert code == 1
     (folder / "right.obs.json").write_bytes((folder / "left.obs.json").read_bytes())
     both = [str(folder / f"{side}.obs.json") for side in ("left", "right")]
-    found = CliRunner().invoke(
-        app, ["calibrate", *both, "-o", str(folder / "both"), *words[4:], "--require", "200m:5%"]
-    )
+    found = ran("calibrate", *both, "-o", folder / "both", *words[4:], "--require", "200m:5%")
     assert found.stdout.count("NO: the lens model pinhole") == 2
     assert found.stderr.count("noise of marks: 0.3 px, assumed") == 1
 

@@ -7,12 +7,10 @@ from pathlib import Path
 import cv2
 import pytest
 import torch
-from command_line import Command, rows_of
+from command_line import Command, invoked, ran, rows_of
 from torch import Tensor
-from typer.testing import CliRunner
 
-from kcal import Camera, Origin
-from kcal.cli.main import app
+from kcal import Camera, KcalError, Origin
 from kcal.cli.rig_sources import Sources, read_sources
 from kcal.io.camera_file import camera_to_file, save_camera
 from kcal.io.images import write_png
@@ -381,9 +379,8 @@ def test_a_rig_from_a_drone(given: Path, command: Command) -> None:
 def test_latitudes_beside_local_positions_are_refused(given: Path) -> None:
     rows = "".join(f"drone0,{t},54.1,7.9,{t},0.02\n" for t in range(60))
     (given / "earth.csv").write_text("name,time,lat,lon,height,sigma\n" + rows)
-    result = CliRunner().invoke(app, [*arguments(given, "earth.csv"), "--positions", str(given / "gnss.csv")])
-    assert result.exit_code == 1
-    assert "--site" in str(result.exception)
+    with pytest.raises(KcalError, match="--site"):
+        invoked(*arguments(given, "earth.csv"), "--positions", given / "gnss.csv")
 
 
 # `kcal rig --scene`: a rig from images and a tape; without a length it is refused.
@@ -411,9 +408,8 @@ def test_a_rig_from_images_and_a_tape(scene_given: list[str], tmp_path: Path, co
 
 
 def test_without_a_length_it_is_refused(scene_given: list[str], tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, scene_given)
-    assert result.exit_code == 1
-    assert "leaves the scale open" in str(result.exception)
+    with pytest.raises(KcalError, match="leaves the scale open"):
+        invoked(*scene_given)
     assert not (tmp_path / "rig.json").exists()
 
 
@@ -435,8 +431,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run_skyline(folder: Path, *options: str) -> tuple[int, str]:
     """`kcal station` with a camera."""
-    given = ["station", str(folder / "mast.camera.json"), "-o", str(folder / "mast.rig.json")]
-    result = CliRunner().invoke(app, [*given, *options])
+    result = ran(*["station", str(folder / "mast.camera.json"), "-o", str(folder / "mast.rig.json")], *options)
     return result.exit_code, " ".join(f"{result.stdout} {result.stderr} {result.exception}".split())
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 from calibrate_scenes import corner_pixels, observe
-from command_line import Command, invoked
-from typer.testing import CliRunner, Result
+from command_line import Command, invoked, ran
+from typer.testing import Result
 
 import kcal
 from kcal import Camera, InputError, Rig, save_camera, save_rig
@@ -92,8 +92,7 @@ class TestMark:
         return tmp_path
 
     def marking(self, *options: str) -> Result:
-        words = ["mark", "l.png", "r.png", "-o", "marks.csv", "--no-browser", *options]
-        return CliRunner().invoke(app, words, env={"COLUMNS": "40"})
+        return ran(*["mark", "l.png", "r.png", "-o", "marks.csv", "--no-browser", *options], env={"COLUMNS": "40"})
 
     @pytest.mark.usefixtures("folder")
     @pytest.mark.parametrize("port", ["70000", "-1", "x"])

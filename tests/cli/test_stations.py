@@ -9,11 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 from click.testing import Result
-from command_line import Command, invoked, rows_of
-from typer.testing import CliRunner
+from command_line import Command, invoked, ran, rows_of
 
 from kcal import Board, Camera, Observations, Origin, Rig, View, load_rig, save_camera, save_rig
-from kcal.cli.main import app
 from kcal.errors import DegenerateError, FileError, InputError
 from kcal.lens.pose import enu_from_cam, rotation_from_vector
 from kcal.locate.budget import station_sigmas
@@ -142,9 +140,7 @@ def surveyed(folder: Path, columns: Columns, *, flat: bool) -> Result:
     lines = [",".join(map(str, (f"p{i}", *columns(i, *place), 0.05))) for i, place in places]
     (folder / "survey.csv").write_text("\n".join(["name,lat,lon,height,sigma", *lines]) + "\n")
     given = [str(folder / "cctv.camera.json"), "--landmarks", str(folder / "survey.csv")]
-    return CliRunner().invoke(
-        app, ["station", *given, "--marks", str(folder / "marks.csv"), "-o", str(folder / "rig.json")]
-    )
+    return ran("station", *given, "--marks", folder / "marks.csv", "-o", folder / "rig.json")
 
 
 @pytest.mark.parametrize("flat", [True, False])
@@ -196,9 +192,7 @@ def test_surveys_of_strangers(kcal_data: Path, tmp_path: Path, folder: str, came
 
     def solved(survey: Path) -> Result:
         given = ["--landmarks", str(survey), "--marks", str(here / "marks.csv"), "--json"]
-        return CliRunner().invoke(
-            app, ["station", str(here / f"{camera}.camera.json"), *given, "-o", str(tmp_path / "rig.json")]
-        )
+        return ran("station", here / f"{camera}.camera.json", *given, "-o", tmp_path / "rig.json")
 
     here = kcal_data / "field" / folder
     as_given = solved(here / "survey.csv")
@@ -254,7 +248,7 @@ def test_two_cameras_take_the_long_table_too(folder: Path) -> None:
 
 def test_show_says_how_each_camera_stands() -> None:
     stored = Path(__file__).parents[1] / "promises" / "files" / "1.0" / "camera-rig.json"
-    text = CliRunner().invoke(app, ["show", str(stored)]).stdout
+    text = ran("show", stored).stdout
     assert text.count("\ncamera ") == 4  # three cameras and the head of the table
     (line,) = [line for line in text.splitlines() if line.startswith("fisheye4 ")]
     rig = load_rig(stored)

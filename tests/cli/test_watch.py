@@ -11,14 +11,12 @@ import orjson
 import polars
 import pytest
 import torch
-from command_line import Command, rows_of
+from command_line import Command, ran, rows_of
 from PIL import Image
-from typer.testing import CliRunner
 from waiting import PATIENCE
 
 import kcal.watch.watcher as watcher_module
 from kcal import InputError, load_rig, save_rig
-from kcal.cli.main import app
 from kcal.lens.rig import Mounting, Origin
 from kcal.locate.budget import planned_rig
 from kcal.watch.history import history_head, history_line
@@ -26,7 +24,6 @@ from kcal.watch.watcher import Webhook
 from tests.helpers.scene_pairs import pair, small_rig
 from tests.helpers.watched_looks import START, row_of, yaw_turn
 
-RUNNER = CliRunner()
 ZERO = torch.zeros(3).double(), torch.ones(3).double()
 
 
@@ -84,15 +81,13 @@ def watched(tmp_path: Path) -> Path:
     rows = [row_of(START + 60.0 * k, yaw_turn(0.01)) for k in range(60)]
     rows += [row_of(START + 3600.0 + 600.0 * k, None) for k in range(60)]
     fingerprint = load_rig(tmp_path / "rig.json").fingerprint
-    text = history_head() + "".join(history_line(row, fingerprint, ZERO) for row in rows)
-    (tmp_path / "h.csv").write_text(text)
+    (tmp_path / "h.csv").write_text(history_head() + "".join(history_line(row, fingerprint, ZERO) for row in rows))
     return tmp_path
 
 
 def marks(folder: Path, times: list[str]) -> Path:
     """A target at 2 km, as the turned rig sees it, at some times."""
-    rig = planned_rig()
-    left, right = rig(torch.tensor([[0.0, 0.0, 2000.0]], dtype=torch.float64))[0].unbind(-2)
+    left, right = planned_rig()(torch.tensor([[0.0, 0.0, 2000.0]], dtype=torch.float64))[0].unbind(-2)
     right = right + torch.tensor([[1600.0 * math.tan(math.radians(0.01)), 0.0]])
     lines = ["name,left_u,left_v,right_u,right_v,time"]
     for k, time in enumerate(times):
@@ -132,12 +127,12 @@ def test_what_locate_needs_for_it(watched: Path, command: Command) -> None:
     words = ["locate", str(watched / "rig.json"), str(points), "--history", str(watched / "h.csv")]
     for text, message in (("yesterday", "p0: time 'yesterday'"), (f"{START - 60}", "tells nothing of that time")):
         marks(watched, [text])
-        found = RUNNER.invoke(app, words)
+        found = ran(*words)
         assert found.exit_code == 1
         assert message in " ".join(str(found.exception).split())
     command(*words, "--aged 9h:0.0004", code=2)
     points.write_text("name,left_u,left_v,right_u,right_v\na,959.5,539.5,951.5,539.5\n")
-    assert "needs a column time" in str(RUNNER.invoke(app, words).exception)
+    assert "needs a column time" in str(ran(*words).exception)
 
 
 def test_live_tracks_have_the_sigma_of_the_moment(watched: Path, command: Command) -> None:
@@ -222,7 +217,7 @@ def test_a_webhook_that_speaks_no_http_ends_nothing() -> None:
 def test_wrong_words(tmp_path: Path, words: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     save_rig(small_rig(), tmp_path / "rig.json")
-    found = RUNNER.invoke(app, ["watch", "rig.json", *words])
+    found = ran("watch", "rig.json", *words)
     assert found.exit_code in (1, 2)
     assert message in " ".join((found.output + str(found.exception)).split())
 

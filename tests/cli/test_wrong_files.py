@@ -14,11 +14,9 @@ import numpy as np
 import pytest
 import torch
 from calibrate_scenes import observe
-from click.testing import Result
-from command_line import Command
+from command_line import Command, invoked, ran
 from printed_boards import printed_points, printed_views
 from typer.main import get_command
-from typer.testing import CliRunner
 
 from kcal import Board, Camera, FileError, KcalError, Observations, View, load_camera, load_rig, save_camera, save_rig
 from kcal.calibrate import load_measured_board
@@ -302,10 +300,6 @@ BOARD = Board(columns=8, rows=6, square=0.03)
 SIZE = (1280, 960)
 
 
-def kcal(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
 def capture(folder: Path, name: str, points: torch.Tensor, seed: int) -> Path:
     camera = Camera.build(focal=(800, 800), center=(645, 476), size=SIZE, coefficients=[-0.12, 0.03], model="opencv5")
     pixels = printed_views(camera, BOARD, points, 8, seed, noise=0.1)
@@ -317,21 +311,19 @@ def test_one_board(tmp_path: Path) -> None:
     points = printed_points(BOARD, 3)
     output, picture = tmp_path / "plate.board.json", tmp_path / "plate.png"
     files = [capture(tmp_path, name, points, seed) for name, seed in (("left", 1), ("right", 2))]
-    result = kcal("board", "measure", *files, "-o", output, "--picture", picture)
-    assert result.exit_code == 0
+    result = invoked("board", "measure", *files, "-o", output, "--picture", picture)
     board = load_measured_board(output)
     assert (board.name, board.observations) == ("plate", ("left", "right"))
-    assert f"bending {1e3 * board.bending.value:.3f} ± {1e3 * board.bending.sigma:.3f} mm" in result.output
-    assert "2 of 2 observations: left, right" in result.output
-    assert "evidence that they saw one board" in result.output
+    assert f"bending {1e3 * board.bending.value:.3f} ± {1e3 * board.bending.sigma:.3f} mm" in result
+    assert "2 of 2 observations: left, right" in result
+    assert "evidence that they saw one board" in result
     assert picture.read_bytes()[:4] == b"\x89PNG"
 
 
 def test_two_boards(tmp_path: Path) -> None:
     files = [capture(tmp_path, name, printed_points(BOARD, seed), seed) for name, seed in (("left", 3), ("right", 4))]
-    result = kcal("board", "measure", *files, "-o", tmp_path / "plate.board.json")
-    assert result.exit_code == 0
-    assert "these observations show 2 boards" in result.output
+    result = invoked("board", "measure", *files, "-o", tmp_path / "plate.board.json")
+    assert "these observations show 2 boards" in result
     assert load_measured_board(tmp_path / "plate.board.json").observations == ("left",)
 
 
@@ -340,7 +332,7 @@ def test_refusals(tmp_path: Path) -> None:
         (["none.obs.json", "-o", tmp_path / "x.board.json"], "cannot read"),
         ([tmp_path / "a.obs.json", "-o", tmp_path / "none" / "x.board.json"], "does not exist"),
     ):
-        result = kcal("board", "measure", *arguments)
+        result = ran("board", "measure", *arguments)
         assert isinstance(result.exception, FileError)
         assert message in str(result.exception)
     assert list(tmp_path.iterdir()) == []
@@ -349,7 +341,7 @@ def test_refusals(tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", [["board"], ["board", "print"]])
 def test_printing_is_the_default(tmp_path: Path, command: list[str]) -> None:
     output = tmp_path / "board.svg"
-    assert kcal(*command, "--board", "9x6", "--square", "25mm", "-o", output).exit_code == 0
+    invoked(*command, "--board", "9x6", "--square", "25mm", "-o", output)
     assert output.read_bytes().startswith(b"<?xml")
 
 

@@ -15,14 +15,12 @@ import numpy as np
 import pytest
 import torch
 from board_render import homography, render
-from command_line import Command
+from command_line import Command, invoked, ran
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 from waiting import PATIENCE
 
 from kcal import Board, FileError, InputError, Observations
-from kcal.cli.main import app
 from kcal.corners import detect as module
 from kcal.corners.detect import detect, detect_board
 from kcal.corners.images import exif_orientation, turned_images
@@ -35,10 +33,6 @@ from kcal.threads import UNSTOPPABLE
 BOARD = Board(columns=6, rows=5, square=0.02)
 
 OPTIONS = ["--board", "6x5", "--square", "20mm", "-o"]
-
-
-def kcal(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.fixture
@@ -54,10 +48,9 @@ def shots(tmp_path):
 def test_failures_are_listed_on_screen_and_in_the_file(shots, tmp_path):
     (shots / "bad.jpg").write_bytes(cv2.imencode(".jpg", cv2.imread(f"{shots}/shot0.png", 0))[1].tobytes()[:1500])
     output = tmp_path / "x.obs.json"
-    result = kcal("detect", shots, *OPTIONS, output)
-    assert result.exit_code == 0
-    assert "board found in 2 of 3 images" in result.output
-    assert "failed bad.jpg: the image is truncated or corrupt" in result.output
+    result = invoked("detect", shots, *OPTIONS, output)
+    assert "board found in 2 of 3 images" in result
+    assert "failed bad.jpg: the image is truncated or corrupt" in result
     assert [failure.name for failure in Observations.load(output).failures] == ["bad.jpg"]
 
 
@@ -71,12 +64,12 @@ def test_each_image_is_read_once(shots, monkeypatch):
 @pytest.mark.parametrize("method", ["saddle", "opencv", "skimage", "none"])
 def test_refine_is_recorded(shots, tmp_path, method):
     output = tmp_path / "x.obs.json"
-    assert kcal("detect", shots / "shot0.png", *OPTIONS, output, "--refine", method).exit_code == 0
+    invoked("detect", shots / "shot0.png", *OPTIONS, output, "--refine", method)
     assert Observations.load(output).refinement == method
 
 
 def refused(error, match, *arguments):
-    result = kcal(*arguments)
+    result = ran(*arguments)
     assert result.exit_code == 1
     assert isinstance(result.exception, error)
     message = str(result.exception)
@@ -128,9 +121,8 @@ def test_shipped_boards_are_what_the_command_draws(tmp_path):
     for size, square, page, sides in (("9x6", "25mm", "A4", "297x210"), ("7x6", "50mm", "A2", "594x420")):
         for suffix in (".svg", ".pdf"):
             output = tmp_path / f"board_{size}_{square}_{page}{suffix}"
-            result = kcal("board", "--board", size, "--square", square, "--paper", page, "-o", output)
-            assert result.exit_code == 0
-            assert f"{size} inner corners, {square[:2]} mm squares, page {sides} mm" in result.output
+            result = invoked("board", "--board", size, "--square", square, "--paper", page, "-o", output)
+            assert f"{size} inner corners, {square[:2]} mm squares, page {sides} mm" in result
             assert output.read_bytes() == (shipped / output.name).read_bytes()
 
 
@@ -272,8 +264,7 @@ SIZE = (240, 200)
 
 @functools.cache
 def still(shift, blur=0.8, seed=0):
-    H = homography(BOARD, SIZE, 20, (0.1, 0.05), 0.1, shift)
-    return render(BOARD, SIZE, H, blur, seed=seed, supersample=2)
+    return render(BOARD, SIZE, homography(BOARD, SIZE, 20, (0.1, 0.05), 0.1, shift), blur, seed=seed, supersample=2)
 
 
 @pytest.fixture(scope="module")
@@ -368,7 +359,7 @@ class TestStream:
         with pytest.raises(FileError, match="camera:97: no stream that answers"):
             detect_video("camera:97", BOARD)
         base = ["--board", "6x5", "--square", "2cm", "-o", str(tmp_path / "o.json")]
-        result = CliRunner().invoke(app, ["detect", stream, "a.png", *base])
+        result = ran("detect", stream, "a.png", *base)
         assert result.exit_code == 1
         assert "searched alone" in str(result.exception) + result.output
 

@@ -192,10 +192,8 @@ def test_corners_keep_a_margin_from_all_four_sides():
     width, height = 70, 60
     y, x = torch.meshgrid(torch.arange(60.0).double(), torch.arange(70.0).double(), indexing="ij")
     for margin, status in ((6.25, CornerStatus.GOOD), (5.75, CornerStatus.OUTSIDE)):
-        places = [(margin, 30.0), (width - 1 - margin, 30.0), (35.0, margin), (35.0, height - 1 - margin)]
-        for u, v in places:
-            image = torch.tanh((x - u) / 2) * torch.tanh((y - v) / 2)
-            found = saddle(image, torch.tensor([[u, v]]).double(), 20.0)
+        for u, v in [(margin, 30.0), (width - 1 - margin, 30.0), (35.0, margin), (35.0, height - 1 - margin)]:
+            found = saddle(torch.tanh((x - u) / 2) * torch.tanh((y - v) / 2), torch.tensor([[u, v]]).double(), 20.0)
             assert int(found.status[0]) == status, (u, v)
 
 

@@ -64,8 +64,7 @@ class TestCorners:
         weight = 0.2 + 0.8 * draw(1, count, size, size, seed=1).abs().clamp_max(1.0)
         axis = torch.arange(size).double() - size // 2
         down, right = torch.meshgrid(axis, axis, indexing="ij")
-        shapes = torch.stack([right, down, right**3, down**3])
-        jacobian = (1.0 + 0.2 * draw(1, count, 4, 1, 1, seed=2)) * shapes
+        jacobian = (1.0 + 0.2 * draw(1, count, 4, 1, 1, seed=2)) * torch.stack([right, down, right**3, down**3])
         half = 0.05 * torch.eye(4) + 0.01 * draw(1, count, 4, 4, seed=3)
         inverse = half @ half.mT
         usable = torch.arange(count)[None] < usable_share * count
@@ -466,8 +465,7 @@ class TestShifts:
         design, root = np.stack(free, -1), np.sqrt(w)
 
         def beyond(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            best = np.linalg.lstsq(design * root[:, None], values * root[:, None], rcond=None)[0]
-            return values - design @ best
+            return values - design @ np.linalg.lstsq(design * root[:, None], values * root[:, None], rcond=None)[0]
 
         normal = (own.T * w) @ beyond(slope)
         inverse = np.linalg.inv(0.5 * (normal + normal.T))
@@ -545,8 +543,7 @@ def test_correlation_is_that_of_numpy(scale: float) -> None:
                 cov = np.cov(template[k].flatten().numpy(), part, aweights=weight[k].flatten().numpy())
                 wanted = cov[0, 1] / np.sqrt(cov[0, 0] * cov[1, 1])
                 assert float(found[k, i, j]) == pytest.approx(-1.0 if (k, i, j) == (1, 2, 3) else wanted)
-    again = weighted_correlation(3.0 * template - 7.0, weight, 0.2 * wide + 30.0, usable)
-    assert again == pytest.approx(found)
+    assert weighted_correlation(3.0 * template - 7.0, weight, 0.2 * wide + 30.0, usable) == pytest.approx(found)
     assert weighted_correlation(torch.ones(2, 4, 5).double(), weight, wide, usable).tolist() == [[[-1.0] * 4] * 3] * 2
     # One place each, and one template for all.
     some = random(3, 4, 5)

@@ -329,8 +329,7 @@ class TestSaddles:
         step, is_saddle = _stationary(coefficients[None])
         assert is_saddle.tolist() == [True]
         # Where 1 + x + 3 y = 0 and -2 + 3 x - 1.4 y = 0.
-        wanted = np.linalg.solve([[1.0, 3.0], [3.0, -1.4]], [-1.0, 2.0])
-        assert step[0].tolist() == pytest.approx(wanted.tolist())
+        assert step[0].tolist() == pytest.approx(np.linalg.solve([[1.0, 3.0], [3.0, -1.4]], [-1.0, 2.0]).tolist())
         bowl = torch.tensor([[0.0, 1.0, 1.0, 1.0, 1.9, 1.0], [0.0, 1.0, 1.0, 1.0, 2.1, 1.0]]).double()
         step, is_saddle = _stationary(bowl)
         assert is_saddle.tolist() == [False, True]

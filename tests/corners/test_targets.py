@@ -142,8 +142,7 @@ def test_all_dictionaries_of_opencv():
 def test_files_of_older_boards_stay_as_they_were():
     content = json.loads(Board.parse("9x6", "25mm").model_dump_json())
     assert content == {"columns": 9, "rows": 6, "square": 0.025, "dictionary": None, "marker": None}
-    old = Board.model_validate_json('{"columns": 9, "rows": 6, "square": 0.025}')
-    assert old == Board.parse("9x6", "25mm")
+    assert Board.model_validate_json('{"columns": 9, "rows": 6, "square": 0.025}') == Board.parse("9x6", "25mm")
 
 
 @pytest.mark.parametrize("text", ["circles:3x3:9mm", "asymmetric:3x3", "aprilgrid:2x2:id8", "charuco:3x3:id12"])

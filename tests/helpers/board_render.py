@@ -32,16 +32,14 @@ def render(board, size, H, blur=1.0, noise=2.0, seed=0, supersample=6, dark_firs
     """
     width, height = size
     n = supersample
-    x = (np.arange(width * n) + 0.5) / n - 0.5
-    u, v = np.meshgrid(x, (np.arange(height * n) + 0.5) / n - 0.5)
+    u, v = np.meshgrid((np.arange(width * n) + 0.5) / n - 0.5, (np.arange(height * n) + 0.5) / n - 0.5)
     G = np.linalg.inv(H)
     w = G[2, 0] * u + G[2, 1] * v + G[2, 2]
     column, across = _stripes((G[0, 0] * u + G[0, 1] * v + G[0, 2]) / w, board.columns)
     row, down = _stripes((G[1, 0] * u + G[1, 1] * v + G[1, 2]) / w, board.rows)
     # +1 on the squares of corner 0's color, -1 on the others, in between where an edge crosses the fine pixel.
     sign = across * down * (1 if dark_first else -1)
-    dark = np.where((column & row) & (w > 0), (1 + sign) / 2, 0.0)
-    fine = (LIGHT + (DARK - LIGHT) * dark).astype(np.float32)
+    fine = (LIGHT + (DARK - LIGHT) * np.where((column & row) & (w > 0), (1 + sign) / 2, 0.0)).astype(np.float32)
     if blur > 0:
         fine = cv2.GaussianBlur(fine, (0, 0), blur * n)
     image = fine.reshape(height, n, width, n).mean((1, 3))

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import pytest
+from typer.testing import CliRunner, Result
 
 
 class Said(NamedTuple):
@@ -20,15 +21,19 @@ class Said(NamedTuple):
     err: str
 
 
-def invoked(*words: object) -> str:
-    """What a command prints; its error is raised."""
-    from typer.testing import CliRunner
-
+def ran(*words: object, **options: Any) -> Result:
+    """How a command ended, with what it printed and its error."""
     from kcal.cli.main import app
 
-    done = CliRunner().invoke(app, [str(word) for word in words])
+    return CliRunner().invoke(app, [str(word) for word in words], **options)
+
+
+def invoked(*words: object) -> str:
+    """What a command prints that must end well; its error is raised."""
+    done = ran(*words)
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
+    assert done.exit_code == 0, done.output
     return done.output
 
 

@@ -45,8 +45,7 @@ def hybrid_camera(kind: str, seed: int = 0, modes: ZernikeModes | None = None) -
     """A camera with a hybrid lens such as a calibration finds: random weights of typical size, decaying with degree."""
     size, (shape, corner) = (1920, 1080), KINDS[kind]
     half, angle = 0.5 * math.hypot(*size), math.radians(corner)
-    q = torch.tensor(shape * angle * angle, dtype=torch.float64)
-    focal = half / (float(radius_over_angle(q)) * angle)
+    focal = half / (float(radius_over_angle(torch.tensor(shape * angle * angle, dtype=torch.float64))) * angle)
     form = HybridForm(shape=shape, radius=1.08 * half / focal, modes=modes or ZernikeModes())
     deviations = []
     for _, _, family, degree in form.modes.real_modes:

@@ -10,14 +10,13 @@ import torch
 from calibrate_scenes import corner_pixels, observe
 from capture_frames import BOARD as PHOTOGRAPHED
 from capture_frames import images
+from command_line import invoked, ran
 from locate_rigs import located_pairs, pinhole_rig
 from starlette.applications import Starlette
 from track_scenes import pairs_of, run_of, tracked_site
-from typer.testing import CliRunner
 
 from kcal import Origin
 from kcal.capture.session import CaptureSession, capture_app
-from kcal.cli.main import app
 from kcal.io.images import write_png
 from kcal.mark.guide import open_pictures
 from kcal.mark.items import Add, Mark, Put
@@ -81,8 +80,7 @@ def marking(folder: Path) -> Iterator[Opened]:
                 desk.session.do(Add(do="add", name=point.name, kind="target"), f"add {point.name}")
             for side, (u, v) in zip(("left", "right"), site.pixels[point.name], strict=True):
                 mark = Mark(u=u, v=v, cov=(0.01, 0.0, 0.01), frame=desk.pictures.names[0])
-                put = Put(do="put", name=point.name, side=side, mark=mark)
-                desk.session.do(put, f"mark {point.name} {side}")
+                desk.session.do(Put(do="put", name=point.name, side=side, mark=mark), f"mark {point.name} {side}")
         desk._wake.set()
         with served(lambda token, hosts: marking_app(desk, token, hosts)) as address:
             yield address, "() => window.kcal && document.documentElement.dataset.pending === 'false'"
@@ -125,10 +123,9 @@ def verdict(folder: Path) -> Iterator[Opened]:
     """`kcal report` on a camera with its views."""
     observe(corner_pixels(14, 3, noise=0.05)).save(folder / "left.obs.json")
     known, seen = folder / "left.camera.json", folder / "left.obs.json"
-    run = CliRunner().invoke
-    run(app, ["calibrate", str(seen), "-o", str(known), "--model", "opencv5"], catch_exceptions=False)
-    asked = ["--require", "50m:10%,1km:5%", "-o", str(folder / "page.html")]
-    run(app, ["report", str(known), "--observations", str(seen), *asked], catch_exceptions=False)
+    invoked("calibrate", seen, "-o", known, "--model", "opencv5")
+    asked = ["--require", "50m:10%,1km:5%", "-o", folder / "page.html"]
+    ran("report", known, "--observations", seen, *asked, catch_exceptions=False)
     yield (folder / "page.html").as_uri(), "() => true"
 
 

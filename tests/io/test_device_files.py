@@ -87,8 +87,7 @@ class TestDepthai:
         right = TURN @ point + [-0.075, 0.001, 0.002]
         assert moved(found, 2, 1, point) == pytest.approx(right, abs=1e-12)
         assert moved(found, 0, 1, point) == pytest.approx(TURN @ right + [0.0375, 0, 0.001], abs=1e-12)
-        said = command("import", tmp_path / "oak.json", "-o", tmp_path / "rig.json")
-        assert "CAM_A, CAM_B, CAM_C" in said.out
+        assert "CAM_A, CAM_B, CAM_C" in command("import", tmp_path / "oak.json", "-o", tmp_path / "rig.json").out
 
     def test_sockets_that_lead_in_a_circle_have_no_poses(self, tmp_path: Path) -> None:
         data = eeprom((0, socket(-1, (0, 0, 0))), (1, socket(2, (1, 0, 0))), (2, socket(1, (1, 0, 0))))

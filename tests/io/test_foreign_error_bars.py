@@ -91,8 +91,7 @@ def test_toml(tmp_path: Path) -> None:
     assert torch.allclose(found.poses[0].rotation, turn, rtol=0, atol=1e-12)
     assert found.poses[0].translation.tolist() == [1, 2, 3]
     assert "taken as meters" in found.notes[0]
-    inside = TOML.replace("[cam_", "[cameras.")
-    scaled = import_cameras(write(tmp_path, "camera_array.toml", inside), meters=1e-3)
+    scaled = import_cameras(write(tmp_path, "camera_array.toml", TOML.replace("[cam_", "[cameras.")), meters=1e-3)
     assert (len(scaled.cameras), scaled.notes) == (2, ())
     assert scaled.poses[0].translation.tolist() == [0.001, 0.002, 0.003]
 
@@ -124,9 +123,8 @@ def test_agisoft_with_its_covariance(tmp_path: Path) -> None:
     across = x * radial + 0.0039 * (r2 + 2 * x * x) + 2 * 0.0004 * x * y
     down = y * radial + 0.0004 * (r2 + 2 * y * y) + 2 * 0.0039 * x * y
     # The manual's formulas, with the first pixel's center at (0.5, 0.5).
-    wanted = [2736 - 17.3 + across * 3241.2 + down * 0.5 - 0.5, 1824 + 51.6 + down * 3239.2 - 0.5]
     assert camera.project(torch.tensor([[x, y, 1.0]], dtype=torch.float64))[0][0].tolist() == pytest.approx(
-        wanted, abs=1e-9
+        [2736 - 17.3 + across * 3241.2 + down * 0.5 - 0.5, 1824 + 51.6 + down * 3239.2 - 0.5], abs=1e-9
     )
     covariance = camera.calibration.covariance
     place = camera.names.index
@@ -157,8 +155,7 @@ def test_opencv_standard_deviations(tmp_path: Path) -> None:
     noisy = [np.float32(view + draw.normal(0, 0.1, view.shape)) for view in views]
     _, k, d, _, _, deviations, _, _ = cv2.calibrateCameraExtended([board] * 8, noisy, (640, 480), None, None)
     found = {"camera_matrix": k, "distortion_coefficients": d, "stdDeviationsIntrinsics": deviations}
-    path = file_storage(tmp_path / "c.yml", image_width=640, image_height=480, **found)
-    (camera,) = import_cameras(path).cameras
+    (camera,) = import_cameras(file_storage(tmp_path / "c.yml", image_width=640, image_height=480, **found)).cameras
     stated = sigmas(camera)
     del stated[4]
     assert stated == pytest.approx(deviations[:9, 0].tolist())

@@ -12,12 +12,11 @@ from typing import Any
 
 import pytest
 import torch
+from command_line import ran
 from lenses import FEW_MODES, hybrid_camera
-from typer.testing import CliRunner
 from wrong_files import assert_refused
 
 from kcal import Camera, FileError, InputError, Rig
-from kcal.cli.main import app
 from kcal.io.camera_file import CameraFile, camera_to_file, load_camera, provenance, save_camera
 from kcal.io.rig_file import RigFile, load_rig, rig_to_file, save_rig
 from kcal.lens.calibration import BoardRecord, CalibrationRecord, CameraCalibration, Exclusion, RigCalibration
@@ -35,8 +34,7 @@ def awkward_camera(model: str | LensModel) -> Camera:
 
 def rotation_about(axis: list[float], angle: float) -> torch.Tensor:
     x, y, z = axis
-    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-    return torch.linalg.matrix_exp(angle * skew)
+    return torch.linalg.matrix_exp(angle * torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64))
 
 
 @pytest.fixture(scope="module")
@@ -358,7 +356,7 @@ def test_a_wrong_summary_counts_as_none(damage: str, at: list[str | int], rig: R
     }[damage]
     paths[1].write_text(json.dumps(content))
     assert load_rig(paths[1]).fingerprint == rig.fingerprint
-    shown = [CliRunner().invoke(app, ["show", str(path)]).output.splitlines()[1:] for path in paths]
+    shown = [ran("show", path).output.splitlines()[1:] for path in paths]
     assert shown[0] == shown[1]
     assert len(shown[0]) > 10
 
@@ -390,8 +388,7 @@ def test_stored_form() -> None:
     assert stored["coefficients"]["pupil1"] == 2e-3
     assert stored["coefficients"]["z5+1"] == float(camera.params[camera.names.index("z5+1")])
     # Files of other lenses do not mention it.
-    plain = Camera.build(focal=(1, 1), center=(0, 0), size=(4, 3))
-    assert "hybrid" not in camera_to_file(plain).dump()["model"]
+    assert "hybrid" not in camera_to_file(Camera.build(focal=(1, 1), center=(0, 0), size=(4, 3))).dump()["model"]
 
 
 def test_covariance_and_rig(tmp_path: Path) -> None:

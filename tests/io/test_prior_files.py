@@ -158,8 +158,7 @@ def test_the_first_model_that_contains_a_lens() -> None:
     assert (found.calibration.name, found.calibration.covariance) == ("north", None)
     camera.params.data[4] = 0.5
     assert held_exactly(camera, ("opencv8",)) is None
-    skewed = held_exactly(camera, ("opencv8",), skew=True)
-    assert skewed.params[[4, 5]].tolist() == camera.params[[4, 5]].tolist()
+    assert held_exactly(camera, ("opencv8",), skew=True).params[[4, 5]].tolist() == camera.params[[4, 5]].tolist()
     # A lens of a pinhole by its numbers is one, a fisheye's is none.
     fisheye = Camera.build(focal=(8, 8), center=(3, 2), size=(6, 4), coefficients=[0.0] * 4, model="fisheye4")
     assert held_exactly(fisheye, ("pinhole", "opencv4")) is None

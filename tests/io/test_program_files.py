@@ -115,8 +115,7 @@ def test_rigs_of_colmap_are_read(tmp_path: Path, kind: str) -> None:
         assert translation.tolist() == pytest.approx([2 * each for each in place], abs=1e-12)
         assert found.cameras[i].params.tolist() == pytest.approx([500 + i, 505, 330, 236, 0, *D[:4]])
     assert any("focal length is a guess" in note for note in found.notes) == (kind == "database")
-    unsaid = import_cameras(tmp_path / "text/cameras.txt").notes
-    assert any("taken as meters (--unit)" in note for note in unsaid)
+    assert any("taken as meters (--unit)" in note for note in import_cameras(tmp_path / "text/cameras.txt").notes)
 
 
 def test_a_colmap_rig_of_any_name_is_read_again(tmp_path: Path) -> None:

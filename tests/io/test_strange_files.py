@@ -594,8 +594,7 @@ def test_three_cameras_are_a_rig(tmp_path: Path, command: Command) -> None:
     ],
 )  # fmt: skip
 def test_pairs(tmp_path: Path, keys: str) -> None:
-    other = [[501.0, 0, 332], [0, 506, 239], [0, 0, 1]]
-    content = dict(zip(keys.split(), (M, D, other, D[:4]), strict=True)) | TWO
+    content = dict(zip(keys.split(), (M, D, [[501.0, 0, 332], [0, 506, 239], [0, 0, 1]], D[:4]), strict=True)) | TWO
     found = import_cameras(written(tmp_path, "a.json", content), meters=1e-2)
     assert found.names == ("left", "right")
     assert found.cameras[1].params.tolist() == [501, 506, 332, 239, 0, *D[:4]]

@@ -75,8 +75,7 @@ def test_positions_are_those_of_the_camera_that_it_stands_for(kind: str) -> None
 def test_gradients_reach_the_weights_of_a_users_camera() -> None:
     mine = Mine()
     pixels = [part.detach() for part in rig(PLAIN, PLAIN)(POINTS)[0].unbind(-2)]
-    localize = Localizer(rig(mine, mine))
-    (gradient,) = torch.autograd.grad(localize(*pixels).enu[..., 2].sum(), mine.focal_length)
+    (gradient,) = torch.autograd.grad(Localizer(rig(mine, mine))(*pixels).enu[..., 2].sum(), mine.focal_length)
     # The depth is the focal length times the baseline over the disparity.
     assert float(gradient) == pytest.approx(float(POINTS[:, 2].sum()) / 900.0, rel=1e-6)
 

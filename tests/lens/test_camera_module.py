@@ -175,8 +175,7 @@ class TestBatches:
 
     def test_one_point_set_a_camera(self) -> None:
         vectors = torch.stack([parameters("opencv5", scale * strong("opencv5")) for scale in (0.0, 1.0)])
-        batch = Camera(vectors, size=(4, 3))
-        pixels, valid = batch.project(torch.stack([POINTS, POINTS.flip(0)]))
+        pixels, valid = Camera(vectors, size=(4, 3)).project(torch.stack([POINTS, POINTS.flip(0)]))
         assert valid.tolist() == [[True] * 3] * 2
         torch.testing.assert_close(
             pixels[1], Camera(vectors[1], size=(4, 3)).project(POINTS.flip(0))[0], rtol=0, atol=1e-14
@@ -238,8 +237,7 @@ class TestRig:
 
     def test_valid_only_if_both_see(self) -> None:
         camera = Camera.build(focal=(100, 100), center=(50, 50), size=(101, 101), model="pinhole")
-        turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
-        rig = Rig.pair(camera, camera, turned, torch.tensor([0.0, 0.0, 5.0]))
+        rig = Rig.pair(camera, camera, torch.diag(torch.tensor([-1.0, 1.0, -1.0])), torch.tensor([0.0, 0.0, 5.0]))
         # The cameras face each other 5 m apart: only what lies between is in front of both.
         points = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 6.0], [0.0, 0.0, -1.0]])
         assert rig(points)[1].all(-1).tolist() == [True, False, False]

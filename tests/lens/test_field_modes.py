@@ -73,8 +73,7 @@ def test_columns_in_memory_that_is_given(kind: str) -> None:
     memory = draw((len(modes) + 2, 3, 2, 7), 7)
     kept = memory.clone()
     modes.fill_columns(memory[1:-1], x, y, scale)
-    wanted = modes.columns(x, y).movedim(1, -2) * scale
-    torch.testing.assert_close(memory[1:-1], wanted, rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(memory[1:-1], modes.columns(x, y).movedim(1, -2) * scale, rtol=1e-12, atol=1e-13)
     assert torch.equal(memory[[0, -1]], kept[[0, -1]])
 
 
@@ -283,8 +282,7 @@ def test_inputs_and_weights_are_not_overwritten() -> None:
     x, y, _ = disc(3, 5)
     weights = torch.randn(len(FEW), generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     kept = x.clone(), y.clone(), weights.clone()
-    first = FEW.field(weights, x, y)
-    assert all(torch.equal(a, b) for a, b in zip(first, FEW.field(weights, x, y), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(FEW.field(weights, x, y), FEW.field(weights, x, y), strict=True))
     assert all(torch.equal(a, b) for a, b in zip(kept, (x, y, weights), strict=True))
 
 
@@ -414,5 +412,4 @@ class TestStep:
             return torch.einsum("ukn,kn->un", weights, turned @ points + moved[:, None])
 
         expected = torch.func.jacfwd(image)(torch.zeros(6).double()).movedim(-1, 0)
-        found = step_rows(weights.transpose(0, 1), r @ points)
-        torch.testing.assert_close(found, expected, rtol=1e-13, atol=1e-13)
+        torch.testing.assert_close(step_rows(weights.transpose(0, 1), r @ points), expected, rtol=1e-13, atol=1e-13)

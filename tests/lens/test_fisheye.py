@@ -48,8 +48,7 @@ def test_kornia_values() -> None:
 
 def points_to(degrees: float, count: int) -> Tensor:
     """Points up to so many degrees off axis, 1 to 50 m away."""
-    generator = torch.Generator().manual_seed(7)
-    angle, turn, distance = torch.rand(3, count, generator=generator, dtype=torch.float64)
+    angle, turn, distance = torch.rand(3, count, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
     angle, turn, distance = math.radians(degrees) * angle, 2 * math.pi * turn, 1 + 49 * distance
     flat = torch.stack([torch.sin(angle) * torch.cos(turn), torch.sin(angle) * torch.sin(turn), torch.cos(angle)], -1)
     return distance[:, None] * flat

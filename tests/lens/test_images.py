@@ -76,8 +76,7 @@ class TestAgainstOthers:
 
     @pytest.mark.parametrize("alpha", [0.0, 1.0])
     def test_cv2_remap_on_a_real_image(self, kcal_data: Path, alpha: float) -> None:
-        gray = cv2.imread(str(kcal_data / "opencv_stereo" / "left01.jpg"), cv2.IMREAD_GRAYSCALE)
-        image = gray.astype(np.float32)
+        image = cv2.imread(str(kcal_data / "opencv_stereo" / "left01.jpg"), cv2.IMREAD_GRAYSCALE).astype(np.float32)
         new = new_pinhole(BARREL, alpha)
         maps = undistort_maps(BARREL, new)
         theirs = cv2.remap(image, maps.map_x, maps.map_y, cv2.INTER_LINEAR)
@@ -295,8 +294,7 @@ def test_edges_coincide_as_in_torch() -> None:
     rows = torch.arange(48.0)[:, None].expand(1, 1, 48, 64)
     size = (40, 36)
     transform = ImageTransform.resize((64, 48), size)
-    images = torch.cat([columns, rows], 1)
-    resized = torch.nn.functional.interpolate(images, size=size[::-1], mode="bilinear")[0]
+    resized = torch.nn.functional.interpolate(torch.cat([columns, rows], 1), size=size[::-1], mode="bilinear")[0]
     pixels = torch.stack(torch.meshgrid(torch.arange(3.0, 37), torch.arange(3.0, 33), indexing="xy"), -1)
     found = torch.stack([image[3:33, 3:37] for image in resized], -1).double()
     assert torch.allclose(transform.to_full(pixels), found, atol=1e-5)

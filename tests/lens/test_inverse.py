@@ -72,15 +72,13 @@ class TestRoundTrip:
     def test_any_coefficients(self, seed: int, scale: float, model: str) -> None:
         """Random lenses, most of them absurd: four at a time, valid or flagged, never wrong."""
         generator = torch.Generator().manual_seed(seed)
-        size = LensModel.named(model).size
-        lens = torch.randn(4, size, generator=generator, dtype=torch.float64) * scale * 0.3
+        lens = torch.randn(4, LensModel.named(model).size, generator=generator, dtype=torch.float64) * scale * 0.3
         head = torch.tensor([2000.0, 1900.0, 960.0, 540.0, 1.0], dtype=torch.float64).expand(4, 5)
         camera = Camera(torch.cat([head, lens], -1), size=(1920, 1080), model=model)
         pixels = torch.rand(4, 40, 2, generator=generator, dtype=torch.float64) * 4000.0 - 1000.0
         rays, valid = camera.unproject(pixels)
         assert bool(torch.isfinite(rays).all())
-        axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        assert torch.equal(rays[~valid], axis.expand_as(rays[~valid]))
+        assert torch.equal(rays[~valid], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(rays[~valid]))
         again, projected = camera.project(rays)
         assert bool(projected[valid].all())
         error = torch.linalg.vector_norm(again - pixels, dim=-1)
@@ -92,8 +90,7 @@ class TestRoundTrip:
     def test_what_was_projected_is_found(self, seed: int, scale: float, model: str) -> None:
         """The other way round: a point that `project` calls valid comes back as the same ray."""
         generator = torch.Generator().manual_seed(seed)
-        size = LensModel.named(model).size
-        lens = torch.randn(4, size, generator=generator, dtype=torch.float64) * scale * 0.1
+        lens = torch.randn(4, LensModel.named(model).size, generator=generator, dtype=torch.float64) * scale * 0.1
         limit = valid_region(lens, model).radius.clamp(max=3.0)
         angle = torch.rand(4, 40, generator=generator, dtype=torch.float64) * 2 * math.pi
         # Within nine tenths of the fold; at the fold itself the inverse has no finite derivative.

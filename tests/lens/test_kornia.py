@@ -196,8 +196,7 @@ def test_undistort_in_sequences() -> None:
     camera = camera_with("opencv5", [-0.2, 0.05])
     image = torch.rand(2, 3, 480, 640)
     wanted = Undistort(camera)(image)[0]
-    chain = ImageSequential(UndistortImage(camera), RandomHorizontalFlip(p=1.0))
-    assert torch.equal(chain(image), wanted.flip(-1))
+    assert torch.equal(ImageSequential(UndistortImage(camera), RandomHorizontalFlip(p=1.0))(image), wanted.flip(-1))
     video = torch.rand(1, 3, 2, 480, 640)  # B C T H W
     frames = torch.stack([Undistort(camera)(video[:, :, i])[0] for i in range(2)], 2)
     flow = VideoSequential(UndistortImage(camera), RandomHorizontalFlip(p=1.0), data_format="BCTHW")

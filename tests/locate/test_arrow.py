@@ -127,5 +127,4 @@ def test_corners_and_residuals_are_tables() -> None:
     result = calibrate_camera(seen)
     table = polars.DataFrame(result)
     assert table.columns == [*corners.columns, "residual_u", "residual_v"]
-    squares = (table["residual_u"].pow(2) + table["residual_v"].pow(2)).mean()
-    assert math.sqrt(squares) == pytest.approx(result.rms)
+    assert math.sqrt((table["residual_u"].pow(2) + table["residual_v"].pow(2)).mean()) == pytest.approx(result.rms)

@@ -10,8 +10,7 @@ from kcal.locate.tabulate import circular_error
 
 def test_circles_lines_and_ellipses() -> None:
     enu = tensor([0.0, 1e6, 0.0]).expand(3, 3)
-    deviations = tensor([1.0, 1.0, 1.0], [1e-3, 1.0, 1e-3], [0.5, 1.0, 2.0])
-    radii = circular_error(enu, torch.diag_embed(deviations**2))
+    radii = circular_error(enu, torch.diag_embed(tensor([1.0, 1.0, 1.0], [1e-3, 1.0, 1e-3], [0.5, 1.0, 2.0]) ** 2))
     # Rayleigh; one-dimensional normal; and by integration for an aspect of two.
     assert radii[0].tolist() == pytest.approx([math.sqrt(2 * math.log(2)), math.sqrt(-2 * math.log(0.05))], rel=5e-3)
     assert radii[1].tolist() == pytest.approx([0.6745, 1.9600], rel=5e-3)

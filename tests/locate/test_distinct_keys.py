@@ -7,11 +7,10 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+from command_line import ran
 from locate_rigs import real_rig
-from typer.testing import CliRunner
 
 from kcal import FileError, save_rig
-from kcal.cli.main import app
 from kcal.locate import marks, tables
 from kcal.locate.marks import read_mark_chunks
 from kcal.locate.tables import DistinctKeys, Doubled, read_chunks
@@ -53,8 +52,7 @@ def test_a_table_that_is_longer_than_memory(tmp_path: Path) -> None:
     path = tmp_path / "long.csv"
     lines = ["name,u", *(f"a{i},{i}" for i in range(100))]
     path.write_text("\n".join(lines) + "\n")
-    read = read_chunks(path, "name,u", ("name", "u"), ("u",), at_once=10)
-    assert sum(len(chunk.names) for chunk in read) == 100
+    assert sum(len(chunk.names) for chunk in read_chunks(path, "name,u", ("name", "u"), ("u",), at_once=10)) == 100
     path.write_text("\n".join([*lines, '"a1",7']) + "\n")
     with pytest.raises(FileError, match=r"long.csv: line 102: the name 'a1' was used on line 3; names must differ"):
         list(read_chunks(path, "name,u", ("name", "u"), ("u",), at_once=10))
@@ -83,7 +81,7 @@ def test_nothing_is_written_of_a_refused_table(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr("kcal.locate.marks.read_chunks", lambda *given, **more: whole(*given, **more | {"at_once": 5}))
     words = ["locate", str(tmp_path / "rig.json"), str(tmp_path / "marks.csv"), "-o", str(tmp_path / "out.csv")]
     words += ["--site", "0,0,0", "--heading", "0"]
-    assert "line 42: the name 'a0' was used on line 2" in str(CliRunner().invoke(app, words).exception)
+    assert "line 42: the name 'a0' was used on line 2" in str(ran(*words).exception)
     assert not (tmp_path / "out.csv").exists()
 
 

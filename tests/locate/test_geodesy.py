@@ -142,8 +142,7 @@ def test_distances_and_azimuths_agree_with_geodesics(origin: Origin) -> None:
 
 def test_up_is_not_height() -> None:
     # A point 5 km off on the tangent plane is 1.96 m above the ellipsoid (d² / 2 R).
-    origin = Origin(lat=19.07, lon=72.87, height=0.0)
-    heights = enu_to_geodetic(around(5000.0) * tensor(1, 1, 0), origin)[:, 2]
+    heights = enu_to_geodetic(around(5000.0) * tensor(1, 1, 0), Origin(lat=19.07, lon=72.87, height=0.0))[:, 2]
     assert heights.tolist() == pytest.approx([1.96] * len(heights), abs=0.02)
 
 
@@ -246,7 +245,8 @@ def test_no_grid_and_bad_grids(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(pyproj.datadir, "get_data_dir", lambda: str(tmp_path))
     monkeypatch.setattr(pyproj.datadir, "get_user_data_dir", lambda *_: str(tmp_path / "none"))
     assert find_geoid() is None
-    assert find_geoid() == (grid(tmp_path / "egm96_15.gtx"), "egm96_15")
+    found = grid(tmp_path / "egm96_15.gtx")
+    assert find_geoid() == (found, "egm96_15")
     (tmp_path / "bad.gtx").write_bytes(b"no grid")
     with pytest.raises(FileError, match="cannot read this geoid grid"):
         geoid_column(find_geoid(tmp_path / "bad.gtx"), np.array([19.0]), np.array([73.0]))

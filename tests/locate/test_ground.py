@@ -90,8 +90,7 @@ def test_errors_are_as_large_as_stated() -> None:
         places.append(real)
     found = on_ground(mounting, torch.cat(marks), level_ground(12.0), 0.5).enu
     found = found - torch.cat(places)
-    spread = torch.cov(found.T)[:2, :2]
-    ratio = torch.linalg.eigvals(torch.linalg.solve(stated.covariance[0, :2, :2], spread)).real
+    ratio = torch.linalg.eigvals(torch.linalg.solve(stated.covariance[0, :2, :2], torch.cov(found.T)[:2, :2])).real
     assert float(ratio.min()) > 0.8
     assert float(ratio.max()) < 1.25
     assert float(stated.range_low) < float(torch.linalg.vector_norm(true)) < float(stated.range_high)
@@ -103,8 +102,7 @@ def raster_file(folder: Path) -> Path:
     heights = np.full((300, 100), 10.0, dtype=np.float32)
     heights[194:206] = 60.0
     heights[:40] = -9999.0
-    zone = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32643", always_xy=True)
-    x, y = zone.transform(ORIGIN.lon, ORIGIN.lat)
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32643", always_xy=True).transform(ORIGIN.lon, ORIGIN.lat)
     transform = rasterio.transform.from_origin(x - 500.0, y + 2500.0, 10.0, 10.0)
     path = folder / "terrain.tif"
     with rasterio.open(path, "w", driver="GTiff", height=300, width=100, count=1, dtype="float32", crs="EPSG:32643",

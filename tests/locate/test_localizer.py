@@ -57,8 +57,7 @@ def test_the_point_has_the_least_weighted_reprojection_error() -> None:
     points = points.requires_grad_()
     again = torch.cat(RIG(points)[0].unbind(-2), -1)
     misses = again - torch.cat([left, right], -1)
-    cost = (misses[:, None] @ torch.linalg.inv(cov) @ misses[..., None]).sum()
-    (gradient,) = torch.autograd.grad(cost, points)
+    (gradient,) = torch.autograd.grad((misses[:, None] @ torch.linalg.inv(cov) @ misses[..., None]).sum(), points)
     # Per meter; the cost changes by one over some meters here.
     assert gradient.abs().max() < 1e-6
 

@@ -51,8 +51,7 @@ def test_the_true_coefficient_gives_the_true_rig() -> None:
     assert float((found.center - CENTER[:2]).abs().max()) < 1e-8
     assert float((found.rotation - ROTATION[:2]).abs().max()) < 1e-11
     # Straight lines bend the rig instead: 0.31 is a fifth of a pixel at 5 km.
-    straight = solved(posts(0.31), refraction=0.0, refraction_sigma=0.0)
-    assert float((straight.center - CENTER[:2]).abs().max()) > 1e-3
+    assert float((solved(posts(0.31), refraction=0.0, refraction_sigma=0.0).center - CENTER[:2]).abs().max()) > 1e-3
 
 
 def test_landmarks_that_tell_it_tell_it() -> None:
@@ -140,8 +139,7 @@ def test_light_of_another_day_is_no_drift() -> None:
 
 
 def test_coefficients_that_cannot_be() -> None:
-    wrong = {"refraction": (2.01, -2.01), "refraction_sigma": (2.01, -0.01, float("nan"))}
-    for name, values in wrong.items():
+    for name, values in {"refraction": (2.01, -2.01), "refraction_sigma": (2.01, -0.01, float("nan"))}.items():
         for value in values:
             with pytest.raises(InputError, match="refraction"):
                 RigOptions(**{name: value})

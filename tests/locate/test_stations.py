@@ -33,8 +33,7 @@ def survey(count: int = 4, seed: int = 0) -> tuple[Rig, RigData]:
     for c in range(count):
         seen[8 + 6 * c : 14 + 6 * c, c] = True
     pixels = marks(rig, points)
-    inside = torch.stack([camera.inside(pixels[:, c]) for c, camera in enumerate(rig.each)], 1)
-    seen &= inside
+    seen &= torch.stack([camera.inside(pixels[:, c]) for c, camera in enumerate(rig.each)], 1)
     pixels = pixels + 0.3 * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
     pixels = torch.where(seen[..., None], pixels, torch.nan)
     kept = seen.any(1)

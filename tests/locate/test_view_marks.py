@@ -7,11 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_line import Command, rows_of
-from typer.testing import CliRunner
+from command_line import Command, ran, rows_of
 
 from kcal import FileError, InputError, Localizer, save_rig
-from kcal.cli.main import app
 from kcal.cli.rig_sources import images_by_camera
 from kcal.locate import enu_to_geodetic, geodetic_to_enu
 from kcal.locate import marks as tables
@@ -132,7 +130,7 @@ def test_one_camera_and_a_terrain(tmp_path: Path, command: Command) -> None:
     pixel = marks(rig, geodetic_to_enu(spot, ORIGIN)[None])[0, 0]
     (tmp_path / "smoke.csv").write_text(f"name,camera,u,v\nsmoke,tower 1,{pixel[0]:.4f},{pixel[1]:.4f}\n")
     words = ["locate", str(tmp_path / "rig.json"), str(tmp_path / "smoke.csv"), "-o", str(tmp_path / "out.csv")]
-    assert CliRunner().invoke(app, words).exit_code != 0, "a bearing is no position"
+    assert ran(*words).exit_code != 0, "a bearing is no position"
     given = ["--terrain", str(tmp_path / "hills.asc"), "--terrain-sigma", "2"]
     command(*words, *given)
     (row,) = rows_of(tmp_path / "out.csv")

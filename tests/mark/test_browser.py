@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 import torch
 from browser import chromium_page, names_on_a_map, needs_browser
+from command_line import invoked
 from marking_browser import Server, choose, click_at, look_at, settled
 from ports import free_port
-from typer.testing import CliRunner
 
 from kcal import load_rig, save_camera, save_rig
-from kcal.cli.main import app
 from kcal.io.images import write_png
 from kcal.locate import read_marks
 from scripts.shared.marking_scene import LANDMARKS, TARGETS, MarkingSite, marking_site
@@ -121,18 +120,14 @@ def test_a_whole_site_while_the_server_is_killed(site: tuple[Path, MarkingSite],
         assert found["low"] - 0.02 * true < true < found["high"] + 0.02 * true
 
     # What `kcal rig` and `kcal locate` make of the files is what the page said.
-    runner, output = CliRunner(), tmp_path / "rig.json"
+    output = tmp_path / "rig.json"
     marks = read_marks(tmp_path / "marks.csv")
     errors = [np.abs(marks.pixels[i].numpy() - np.stack(scene.pixels[name])) for i, name in enumerate(marks.names)]
     assert np.max(errors) < 0.6
-    done = runner.invoke(
-        app,
-        ["rig", *(str(folder / f"{side}.camera.json") for side in ("left", "right")), "--landmarks",
-         str(tmp_path / "marks.landmarks.csv"), "--marks", str(tmp_path / "marks.csv"), "--site", "40,-113,1280",
-         "--pixel-sigma", str(solved["sigma"]), "-o", str(output)],
-    )  # fmt: skip
-    assert done.exit_code == 0, done.output
+    cameras = (folder / f"{side}.camera.json" for side in ("left", "right"))
+    files = ["--landmarks", tmp_path / "marks.landmarks.csv", "--marks", tmp_path / "marks.csv"]
+    invoked("rig", *cameras, *files, "--site", "40,-113,1280", "--pixel-sigma", solved["sigma"], "-o", output)
     assert float(load_rig(output).baseline) == pytest.approx(float(scene.rig.baseline), abs=0.1)
-    done = runner.invoke(app, ["locate", str(output), str(tmp_path / "marks.points.csv"), "--refraction", "0"])
-    assert done.exit_code == 0, done.output
-    assert "the noise that the CSV states" in done.output
+    assert "the noise that the CSV states" in invoked(
+        "locate", output, tmp_path / "marks.points.csv", "--refraction", "0"
+    )

@@ -123,8 +123,7 @@ class TestCurve:
         rig = Rig.pair(cameras[0], cameras[1], turn, shift)
         ends = [len(value) for value in values]
         size = torch.cat([*(1e-3 * value.abs() + 1e-5 for value in values), torch.full((6,), 1e-3).double()])
-        generator = torch.Generator().manual_seed(0)
-        half = size * torch.randn(4, len(size), generator=generator, dtype=torch.float64)
+        half = size * torch.randn(4, len(size), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         rig.covariance = RigCovariance(half=half)
         curve = RigBand(rig).curve(side, 700.0, 400.0)
         along = torch.nn.functional.normalize(torch.gradient(curve.pixels, dim=0)[0], dim=-1)
@@ -415,8 +414,7 @@ def test_what_is_not_pending_is_solved(site: MarkingSite, tmp_path: Path, monkey
 
     monkeypatch.setattr(desk, "_solve", held)
     desk.session.do(Add(do="add", name="mast", kind="landmark"), "key-00001")
-    place = Place(at=(1.0, 2.0, 3.0), sigma=0.1)
-    desk.session.do(SurveyPlace(do="survey", name="mast", place=place), "key-00002")
+    desk.session.do(SurveyPlace(do="survey", name="mast", place=Place(at=(1.0, 2.0, 3.0), sigma=0.1)), "key-00002")
     for side, (u, v) in zip(("left", "right"), site.pixels["gate"], strict=True):
         mark = Mark(u=u, v=v, cov=(0.01, 0.0, 0.01), frame="left")
         desk.session.do(Put(do="put", name="mast", side=cast("Side", side), mark=mark), f"key-{side}")

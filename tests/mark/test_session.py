@@ -65,8 +65,7 @@ def session(tmp_path: Path, survey: Path) -> Session:
 
 
 def test_the_files_are_those_that_rig_and_locate_read(session: Session) -> None:
-    marks = read_marks(session.files.marks, single=True)
-    found = match_landmarks(read_survey(session.files.landmarks), marks, 0.1)
+    found = match_landmarks(read_survey(session.files.landmarks), read_marks(session.files.marks, single=True), 0.1)
     assert found.landmarks.names == ("post", "roof")
     assert found.landmarks.pixels[0].tolist() == [[10.1, 20.2], [9.1, 20.3]]
     assert found.landmarks.pixels[1, 1].isnan().all()
@@ -120,8 +119,7 @@ def test_a_place_that_no_survey_has_is_refused(tmp_path: Path, survey: Path) -> 
         with pytest.raises(InputError, match=complaint):
             session.do(SurveyPlace(do="survey", name="post", place=Place(at=at, sigma=1.0)), "key-0001")
     # Exchanged latitude and longitude: kcal rig refuses the file. The session begins again, so that they can be mended.
-    places = {"post": (20.0, 50.0, 1.0), "roof": (20.1, 50.0, 1.0), "hill": (50.0, 20.0, 1.0)}
-    for name, at in places.items():
+    for name, at in {"post": (20.0, 50.0, 1.0), "roof": (20.1, 50.0, 1.0), "hill": (50.0, 20.0, 1.0)}.items():
         session.do(SurveyPlace(do="survey", name=name, place=Place(at=at, sigma=1.0)), f"key-of-{name}")
     with pytest.raises(FileError, match="exchanged"):
         read_survey(session.files.landmarks)

@@ -48,8 +48,7 @@ def test_the_likelihood_is_that_of_what_no_unknown_explains() -> None:
 @pytest.mark.parametrize(("length", "strength"), [(2.0, 3.0), (18.0, 10.0), (6.0, 0.0)])
 def test_the_texture_is_found(length: float, strength: float) -> None:
     unknowns = np.concatenate([np.ones((len(WHERE), 1)), WHERE / 12], 1)
-    draws = textures(length, math.sqrt(strength), 1.0, 2, 12).T
-    found = [texture_of(WHERE, draw, unknowns) for draw in draws]
+    found = [texture_of(WHERE, draw, unknowns) for draw in textures(length, math.sqrt(strength), 1.0, 2, 12).T]
     if strength == 0:
         assert sum(texture.strength == 0 for texture in found) >= 10
     else:

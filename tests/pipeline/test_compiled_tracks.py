@@ -28,8 +28,7 @@ def scene(localize: Localizer, frame: int) -> tuple[torch.Tensor, torch.Tensor]:
     seen = torch.ones(count, dtype=torch.bool)
     if frame in (12, 13):
         seen[2:5] = False
-    generator = torch.Generator().manual_seed(frame)
-    return seen_by(localize.rig, torch.stack([x, 0.01 * z, z], -1)[seen], 0.2, generator)
+    return seen_by(localize.rig, torch.stack([x, 0.01 * z, z], -1)[seen], 0.2, torch.Generator().manual_seed(frame))
 
 
 @pytest.mark.slow

@@ -209,8 +209,7 @@ class TestRefusals:
         edge = torch.tensor([[-8.0, 40, 4, 52]], dtype=torch.float64)
         self.check(match(scene, boxes=edge, aims=torch.tensor([[5.0, 46.0]])), MatchStatus.OUTSIDE)
         self.check(match(scene, boxes=torch.full((1, 4), torch.nan)), MatchStatus.NO_RAY)
-        nowhere = torch.full((1, 2), torch.inf)
-        found = ObjectDisparity(scene.rig)(scene.left, scene.right, scene.boxes, nowhere)
+        found = ObjectDisparity(scene.rig)(scene.left, scene.right, scene.boxes, torch.full((1, 2), torch.inf))
         assert int(found.status[0]) == MatchStatus.NO_RAY
 
 

@@ -367,8 +367,7 @@ def test_a_turning_target_goes_in_a_circle_to_the_left() -> None:
         state = moved(state, after((Motion(acceleration=0.0, turn_rate=rate),), 1.0)).state
         if step == 9:
             # A quarter, seen from above, to the left of eastward is away from the camera.
-            expected = torch.tensor([0.0, 0.0, 10.0]).double()
-            torch.testing.assert_close(state[3:, 0, 0] / state[2, 0, 0], expected)
+            torch.testing.assert_close(state[3:, 0, 0] / state[2, 0, 0], torch.tensor([0.0, 0.0, 10.0]).double())
     torch.testing.assert_close(state, state_of(place, velocity), rtol=1e-9, atol=1e-12)
 
 
@@ -417,8 +416,7 @@ def test_rates_are_those_of_straight_motion() -> None:
 
     # The second derivative is left out: 1e-6 s of half of 1e-3 a second.
     torch.testing.assert_close((later(1e-6) - later(0.0)) / 1e-6, found, rtol=1e-6, atol=1e-9)
-    by_autograd = torch.autograd.functional.jacobian(rates, state)
-    torch.testing.assert_close(by_state, by_autograd, rtol=1e-12, atol=0.0)
+    torch.testing.assert_close(by_state, torch.autograd.functional.jacobian(rates, state), rtol=1e-12, atol=0.0)
 
 
 @pytest.mark.parametrize("memory", [math.inf, 0.8, 5000.0])
@@ -524,8 +522,7 @@ def test_smoothed_states_are_consistent_and_sharper() -> None:
     velocity = 8.0 * torch.randn(count, 3, generator=generator).double()
     yaws = math.radians(0.003) * torch.randn(count, generator=generator).double()
     rigs = [yawed_rig(localize.rig, float(yaw)) for yaw in yaws]
-    options = TrackOptions(motions=(Motion(acceleration=0.01),), speed_mps=8.0)
-    tracker = Tracker(localize, options, record=True)
+    tracker = Tracker(localize, TrackOptions(motions=(Motion(acceleration=0.01),), speed_mps=8.0), record=True)
     places = []
     for frame in range(frames):
         places.append(start + frame / 10.0 * velocity)

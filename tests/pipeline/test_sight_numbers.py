@@ -223,8 +223,7 @@ class TestGroups:
         assert trees._enough(self.groups(some), 2).tolist() == [True, True, False]
         assert trees._enough(self.groups(some), 0).tolist() == [True, False, False]
         # Cameras that do not have the point in their image have not missed it.
-        narrow = confirming(sights(), inner=0.999999)
-        assert narrow._enough(self.groups(some), 0).tolist() == [True, True, False]
+        assert confirming(sights(), inner=0.999999)._enough(self.groups(some), 0).tolist() == [True, True, False]
         limit = 7.0 + 4.0 * math.sqrt(14.0)
         for share, good in ((0.99, True), (1.01, False)):
             assert trees._enough(self.groups(whole[None], share * limit / 5.0), 0).tolist() == [good]
@@ -265,8 +264,7 @@ class TestGroups:
             some, _ = trees._confirmed(meet, (0, 1), misses, own, found)
             whole = marks_of(0, 1, 2)
             whole[whole == 7] = -1
-            hit = {tuple(row) for row in some.tolist()} & {tuple(row) for row in whole.tolist()}
-            assert len(hit) == count
+            assert len({tuple(row) for row in some.tolist()} & {tuple(row) for row in whole.tolist()}) == count
 
     def test_everything_at_once(self) -> None:
         for kinds in (1, 2):

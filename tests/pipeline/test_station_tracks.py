@@ -78,8 +78,7 @@ def test_errors_of_tracks_are_as_large_as_stated() -> None:
     for second in range(8):
         places = start + second * velocity
         pixels = marks(rig, places, errors) + torch.randn(count, 4, 2, generator=g).double()
-        seen = torch.rand(count, 4, generator=g) < 0.8
-        tracks = tracker(views_of(pixels, seen, float(second)), float(second))
+        tracks = tracker(views_of(pixels, torch.rand(count, 4, generator=g) < 0.8, float(second)), float(second))
     ok = tracks.state.status == 0
     assert int(ok.sum()) > 50
     near = torch.cdist(tracks.state.enu[ok], places).argmin(-1)

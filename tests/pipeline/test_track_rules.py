@@ -122,8 +122,7 @@ class TestRules:
         assert scene.tracker.shared.start == pytest.approx(50.0 - 30.2)
 
     def test_the_category_has_the_highest_sum_of_scores(self) -> None:
-        record = TrackRecord(1, 1, 0.0, 0.0, 3, 3, 0.0, {"car": 0.9, "ship": 1.1, "bird": 0.4})
-        assert record.category == "ship"
+        assert TrackRecord(1, 1, 0.0, 0.0, 3, 3, 0.0, {"car": 0.9, "ship": 1.1, "bird": 0.4}).category == "ship"
         scene = Scene()
         for k, (name, score) in enumerate((("car", 0.9), ("ship", 0.6), ("ship", 0.5), ("car", 0.1))):
             pairs = scene.pairs(0.1 * k, HERE)

@@ -87,8 +87,7 @@ def test_nearest_frames_each_once() -> None:
 
 def test_a_video_that_ends_first_ends_the_pairs() -> None:
     frames = iter(map(Frame, np.arange(0.0, 1e6)))
-    both = [frames, map(Frame, (0.0, 1.0, 2.0))]
-    assert len(list(frames_together(both, lambda _: 0.0, 0.4, whole=True))) == 3
+    assert len(list(frames_together([frames, map(Frame, (0.0, 1.0, 2.0))], lambda _: 0.0, 0.4, whole=True))) == 3
     assert next(frames).time < 10
 
 

@@ -6,12 +6,11 @@ from typing import Any
 
 import jsonschema
 import pytest
-from typer.testing import CliRunner
+from command_line import ran
 
 from kcal import Observations, load_camera, load_rig, save_camera, save_rig
 from kcal.calibrate.hybrid.measured_board import load_measured_board, save_measured_board
 from kcal.cli.cameras import FILES, file_schema
-from kcal.cli.main import app
 
 STORED = Path(__file__).parent / "files"
 WRITTEN = {
@@ -53,8 +52,7 @@ def test_what_is_written_fits(kind: str, tmp_path: Path) -> None:
 
 
 def test_command() -> None:
-    told = json.loads(CliRunner().invoke(app, ["schema", "board", "--json"]).stdout)
-    assert told["schema"] == file_schema("board")
-    assert json.loads(CliRunner().invoke(app, ["schema", "rig"]).stdout) == file_schema("rig")
-    assert [line.split()[0] for line in CliRunner().invoke(app, ["schema"]).stdout.splitlines()[1:]] == [*FILES]
-    assert "no kind of file is called 'car'" in str(CliRunner().invoke(app, ["schema", "car"]).exception)
+    assert json.loads(ran("schema", "board", "--json").stdout)["schema"] == file_schema("board")
+    assert json.loads(ran("schema", "rig").stdout) == file_schema("rig")
+    assert [line.split()[0] for line in ran("schema").stdout.splitlines()[1:]] == [*FILES]
+    assert "no kind of file is called 'car'" in str(ran("schema", "car").exception)

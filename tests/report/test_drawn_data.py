@@ -101,8 +101,7 @@ class TestSites:
         assert len(figure.axes) == 1
         found = siting_map(area, towers)
         shown = np.ma.filled(figure.axes[0].collections[0].get_array(), np.nan)
-        expected = np.where(found.seen_by.numpy() < 2, found.seen_by.numpy(), np.nan)
-        np.testing.assert_array_equal(shown, expected)
+        np.testing.assert_array_equal(shown, np.where(found.seen_by.numpy() < 2, found.seen_by.numpy(), np.nan))
 
     def test_light_comes_from_the_northwest(self) -> None:
         area, towers, _ = sites()

@@ -198,8 +198,7 @@ class TestScores:
         assert far["contained"] == pytest.approx(2 / 3)
         assert far["level_m"] == pytest.approx(2.0, abs=1e-3)
         assert far["range_off_m"] == pytest.approx(4.0)
-        place = _place_at(np.array([[0.0, 1.0], [10.0, 5.0]]), np.array([1.0, 3.0]), 1.5)
-        assert place.tolist() == [2.5, 2.0]
+        assert _place_at(np.array([[0.0, 1.0], [10.0, 5.0]]), np.array([1.0, 3.0]), 1.5).tolist() == [2.5, 2.0]
 
 
 class TestTables:

@@ -11,13 +11,12 @@ from typing import Any
 import pytest
 import torch
 from calibrate_scenes import motions, observe, pixels_of
+from command_line import ran
 from locate_rigs import located_pairs
 from PIL import Image
-from typer.testing import CliRunner
 
 import kcal
 from kcal import Board, CalibrationOptions, Camera, Landmarks, Observations, Origin, Rig, RigData, RigOptions
-from kcal.cli.main import app
 
 ROOT = Path(__file__).parents[2]
 NASTY = "<b>north & \x1b[2J$x^$"
@@ -80,8 +79,7 @@ def calibrated() -> Any:
 
 def test_a_camera_is_the_table_of_the_command_line(calibrated: Any, tmp_path: Path) -> None:
     found = read(calibrated.camera)
-    path = kcal.save_camera(calibrated.camera, tmp_path / "c.camera.json")
-    printed = CliRunner().invoke(app, ["show", str(path)]).output
+    printed = ran("show", kcal.save_camera(calibrated.camera, tmp_path / "c.camera.json")).output
     assert [line for line in found.text.splitlines() if line.strip() and line.strip() not in printed] == []
     names = ["fx", "fy", "cx", "cy", "skew", "k1", "k2", "p1", "p2", "k3"]
     assert [row[0] for row in found.rows] == ["parameter", *names]
@@ -98,7 +96,7 @@ def test_cameras_that_no_table_shows_have_their_repr() -> None:
 
 def test_rigs_of_two_cameras_and_of_many() -> None:
     rig = kcal.load_rig(ROOT / "assets" / "sample-rig.json")
-    printed = CliRunner().invoke(app, ["show", str(ROOT / "assets" / "sample-rig.json")]).output
+    printed = ran("show", ROOT / "assets" / "sample-rig.json").output
     found = read(rig)
     lines = [line.strip() for line in found.text.splitlines() if line.strip()]
     assert len(lines) > 20

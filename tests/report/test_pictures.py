@@ -88,8 +88,7 @@ def test_the_share_that_boards_reached_is_everywhere_the_same() -> None:
 def test_a_gallery_is_in_order_after_what_stands_out() -> None:
     seen = observed(6)
     views = list(seen.views)
-    blurred = tuple((0.09, 0.0, 0.09) for _ in range(BOARD.corners))
-    views[4] = views[4].model_copy(update={"covariance": blurred})
+    views[4] = views[4].model_copy(update={"covariance": tuple((0.09, 0.0, 0.09) for _ in range(BOARD.corners))})
     views[2] = views[2].model_copy(
         update={"pixels": (None, *views[2].pixels[1:]), "covariance": (None, *views[2].covariance[1:])}
     )
@@ -148,8 +147,7 @@ def test_no_axes_cover_each_other(name: str) -> None:
         assert -1 <= box.x0 < box.x1 <= wide + 1
         assert -1 <= box.y0 < box.y1 <= tall + 1
     for one, other in itertools.combinations(axes, 2):
-        across = min(one.x1, other.x1) - max(one.x0, other.x0)
-        assert min(across, min(one.y1, other.y1) - max(one.y0, other.y0)) < 1
+        assert min(min(one.x1, other.x1) - max(one.x0, other.x0), min(one.y1, other.y1) - max(one.y0, other.y0)) < 1
     # Most of the page is used.
     assert sum(box.width * box.height for box in axes) > 0.3 * wide * tall
 

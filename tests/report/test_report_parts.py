@@ -107,8 +107,7 @@ class TestViews:
         ]
         seen = Observations(board=board, image_size=(640, 480), views=tuple(views))
         assert _blurred_share(seen) == pytest.approx(0.25)
-        bare = [View(name="a", pixels=pixels)]
-        assert _blurred_share(seen.model_copy(update={"views": tuple(bare)})) == 0.0
+        assert _blurred_share(seen.model_copy(update={"views": tuple([View(name="a", pixels=pixels)])})) == 0.0
 
     def test_names_of_two_cameras(self) -> None:
         pairs = [f"{side}{i:02}.png" for side in ("left", "right") for i in range(3)]
@@ -218,8 +217,7 @@ class TestModel:
 class TestAnswers:
     def test_a_range_by_two_cameras(self) -> None:
         """√2 Z² / (f B) for each pixel of either camera."""
-        need = Requirement(distance=1000.0, meters=50.0)
-        parts = _camera_answers(CAMERA, [need], 0.2, 0.5, 8.0, 0.3)[0].parts
+        parts = _camera_answers(CAMERA, [Requirement(distance=1000.0, meters=50.0)], 0.2, 0.5, 8.0, 0.3)[0].parts
         slope = math.sqrt(2) * 1e6 / (800 * 8)
         assert parts == pytest.approx({"marks": 0.3 * slope, "lenses": 0.2 * slope, FAULTS: 0.5 * slope})
 
@@ -257,8 +255,7 @@ class TestAnswers:
         for left, right, worst in ((3.0, 2.0, 3.0), (0.5, 0.4, 1.0), (0.5, 2.0, 2.0), (math.nan, 2.0, math.nan)):
             asked.clear()
             totals.update({0.5 * 1920 - 0.3 * 1920: left, 0.5 * 1920 + 0.3 * 1920: right})
-            found = float(_worst_of_pair(rig, 1000.0, pixel_sigma=0.3).total)
-            assert found == pytest.approx(worst, nan_ok=True)
+            assert float(_worst_of_pair(rig, 1000.0, pixel_sigma=0.3).total) == pytest.approx(worst, nan_ok=True)
             assert [None if place is None else place[0] for place in asked] == [None, *places]
             assert asked[1][1] == 540
         totals.clear()

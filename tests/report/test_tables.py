@@ -19,8 +19,7 @@ def test_positions_and_what_they_miss() -> None:
     left, right = pinhole_rig()(tensor([0.0, 0.0, 100.0]))[0].unbind(-2)
     left, right = torch.cat([left, tensor([5000.0, 1.0])]), torch.cat([right, tensor([1.0, 1.0])])
     located = located_pairs(pinhole_rig(), left, right, origin=ORIGIN, heading_deg=0.0, names=["gate", "lost"])
-    truth = tensor([3.0, 96.0, 0.0], [math.nan] * 3)
-    heads, gate, lost = position_rows(located, position_errors(located, truth))
+    heads, gate, lost = position_rows(located, position_errors(located, tensor([3.0, 96.0, 0.0], [math.nan] * 3)))
     assert gate[:1] + gate[4:5] == ["gate", "100.00"]
     assert dict(zip(heads, gate, strict=True))["off level m"] == "5.00"
     assert dict(zip(heads, gate, strict=True))["off in range m"] == "+3.95"

@@ -318,13 +318,11 @@ def pair_pixels(moved: Tensor, poses: tuple[Tensor, Tensor]) -> tuple[Rig, Tenso
 
 def test_pairs_that_were_not_taken_together_are_named(poses: tuple[Tensor, Tensor]) -> None:
     still = torch.zeros(VIEWS, 3, dtype=torch.float64)
-    found = synchrony(pair_pixels(still, poses)[0], BOARD.points, pair_pixels(still, poses)[1])
-    assert 0.5 < found.ratio < 1.6
+    assert 0.5 < synchrony(pair_pixels(still, poses)[0], BOARD.points, pair_pixels(still, poses)[1]).ratio < 1.6
     moved = 5e-3 * torch.randn(VIEWS, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     rig, pixels = pair_pixels(moved, poses)
     assert "synchronization" in names(rig_verdict(rig, pairs=(BOARD.points, pixels)), "stop")
-    calm = rig_verdict(rig, pairs=(BOARD.points, pair_pixels(still, poses)[1]))
-    assert "synchronization" in names(calm, "fine")
+    assert "synchronization" in names(rig_verdict(rig, pairs=(BOARD.points, pair_pixels(still, poses)[1])), "fine")
 
 
 def test_a_late_camera_is_told_by_how_much(poses: tuple[Tensor, Tensor]) -> None:
@@ -357,8 +355,7 @@ def page(*findings: Finding, subject: str = "left") -> str:
 def test_the_page_says_what_the_verdict_says() -> None:
     assert ">YES<" in page()
     assert "At 1 km the range is known to ±3.6 %; 5 % are required." in page()
-    stop = Finding(name="blur", severity="stop", text="corners scatter by 2 px", action="hold still")
-    refused = page(stop)
+    refused = page(Finding(name="blur", severity="stop", text="corners scatter by 2 px", action="hold still"))
     assert ">NO<" in refused
     assert "Corners scatter by 2 px." in refused
     assert "Hold still." in refused

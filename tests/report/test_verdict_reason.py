@@ -64,8 +64,7 @@ def test_a_fault_is_a_reason_only_where_it_breaks_the_requirement() -> None:
     large = verdict(faults(500.0, 600.0, 40.0, 900.0), SLIGHT)
     assert (large.reason, large.next_step) == (SLIGHT.text, SLIGHT.action)
     # It is not most of it, but without it the requirement would be met.
-    last = verdict(faults(500.0, 400.0, 40.0, 350.0), SLIGHT)
-    assert [finding.severity for finding in last.findings] == ["stop"]
+    assert [finding.severity for finding in verdict(faults(500.0, 400.0, 40.0, 350.0), SLIGHT).findings] == ["stop"]
     assert verdict(faults(1000.0, 400.0, 40.0, 350.0), SLIGHT).usable
 
 

@@ -30,8 +30,7 @@ def test_off_the_line_by_so_many_pixels(roll: float) -> None:
     turn = rig.right_from_left_rotation[:2, :2]
     left = torch.tensor([[250.0, 170.0], [100.0, 60.0], [400.0, 300.0]]).double()
     middle = torch.tensor([240.0, 160.0]).double()
-    apart = torch.tensor([[-9.0, 0.7], [-3.0, -0.4], [-30.0, 0.0]]).double()
-    right = (left + apart - middle) @ turn.T + middle
+    right = (left + torch.tensor([[-9.0, 0.7], [-3.0, -0.4], [-30.0, 0.0]]).double() - middle) @ turn.T + middle
     own = torch.tensor([[0.04, 0.01], [0.01, 0.09]]).double()
     found = line_errors(rig, torch.stack([left, right], 1))
     assert float(torch.sign(found.off[0])) * found.off == pytest.approx([0.7, -0.4, 0.0], abs=1e-3)

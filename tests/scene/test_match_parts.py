@@ -121,8 +121,7 @@ def test_whole_shifts() -> None:
 def test_patches_are_those_of_the_lens() -> None:
     """Nine places and a parabola against the projection of all; slopes against differences."""
     left = torch.tensor([[300.0, 200.0], [60.0, 40.0]]).double()
-    right = RIG(80.0 * RIG.left.unproject(left)[0])[0][:, 1]
-    planes = object_planes(RIG, left, right, torch.zeros(2).double())
+    planes = object_planes(RIG, left, RIG(80.0 * RIG.left.unproject(left)[0])[0][:, 1], torch.zeros(2).double())
     for camera, middle, turn in (
         (RIG.left, planes.left, None),
         (RIG.right, planes.right, RIG.right_from_left_rotation),

@@ -13,7 +13,6 @@ from kcal.scene import common_errors
 from kcal.scene.common_errors import LineErrors, line_errors, pose_variance_ratio, with_common_errors
 from tests.helpers.scene_pairs import SIZE, drawn_pixels, small_rig
 
-
 RIG = small_rig()
 SIGMA = 0.05
 COUNT = 600

@@ -360,8 +360,7 @@ def test_area_averages_are_integrals():
 
 def test_visible_is_valid_and_inside():
     camera = Camera.build(focal=(800, 800), center=(319.0, 239.5), size=(640, 480))
-    pose = Pose(torch.eye(3), torch.tensor([0.0, 0.0, 1.0]))
-    pixels, visible = project_board(camera, pose, BoardSize(9, 2, 0.1))
+    pixels, visible = project_board(camera, Pose(torch.eye(3), torch.tensor([0.0, 0.0, 1.0])), BoardSize(9, 2, 0.1))
     assert pixels[:, 0].tolist() == pytest.approx([319.0 + 80 * i for i in range(9)] * 2)
     assert visible.tolist() == ([True] * 5 + [False] * 4) * 2  # the fifth lies half a pixel inside the edge at 639.5
 

@@ -72,8 +72,7 @@ def test_the_covariance_is_of_turns_about_east_north_up() -> None:
 
 def test_shifts_of_the_raster_are_within_their_sigma() -> None:
     # The whole raster 2 m higher: ridges at several distances tell it from a camera that looks up, if it is stated.
-    stated = RasterError(sigma=0.5, offset=2.0, refraction_sigma=0.03)
-    one = found(raster=raster_of(heights() + 2.0), error=stated)
+    one = found(raster=raster_of(heights() + 2.0), error=RasterError(sigma=0.5, offset=2.0, refraction_sigma=0.03))
     assert abs(errors(one)).max() < 2.0
     assert one.sigma_deg[1] > 1.3 * as_it_is().sigma_deg[1]
 

@@ -72,8 +72,7 @@ def test_the_eye_on_the_earths_curve() -> None:
 
 
 def test_a_raster_that_ends_is_no_horizon() -> None:
-    site = small_site()
-    found = terrain_horizon(raster_of(heights()[200:280, 200:280]), site.place, np.linspace(-3.0, 3.0, 100))
+    found = terrain_horizon(raster_of(heights()[200:280, 200:280]), small_site().place, np.linspace(-3.0, 3.0, 100))
     # Its ground rises to its end nearly everywhere; where it does not, what is beyond may be higher.
     assert found.known.mean() < 0.5
     assert found.doubtful[found.known].mean() > 0.9

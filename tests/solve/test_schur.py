@@ -336,8 +336,7 @@ def test_the_undamped_step_is_that_of_least_squares() -> None:
 
 def test_blending_takes_elements_from_both() -> None:
     one, other = DenseLinearization(DENSE_RESIDUALS, JACOBIAN), DenseLinearization(2.0 * DENSE_RESIDUALS, JACOBIAN)
-    both = one.blend(torch.tensor([True, False]), other)
-    assert both.cost.tolist() == [other.cost[0].item(), one.cost[1].item()]
+    assert one.blend(torch.tensor([True, False]), other).cost.tolist() == [other.cost[0].item(), one.cost[1].item()]
 
 
 # Batches whose elements stop at different times end as each of them alone does.

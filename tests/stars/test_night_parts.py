@@ -35,8 +35,7 @@ class TestSky:
     def test_light_that_grows_across_the_image_is_followed(self) -> None:
         """A gradient of the sky is its level, tile by tile, but at the rim, where the outermost tile's level holds."""
         level, noise = _night_sky(100.0 + 0.2 * COLUMNS + 0.1 * ROWS, quantum=0.0)
-        inside = level[60:180, 60:260] - (100.0 + 0.2 * COLUMNS + 0.1 * ROWS)[60:180, 60:260]
-        assert np.abs(inside).max() < 1.5
+        assert np.abs(level[60:180, 60:260] - (100.0 + 0.2 * COLUMNS + 0.1 * ROWS)[60:180, 60:260]).max() < 1.5
         assert level.shape == noise.shape == (240, 320)
 
     def test_noise_of_the_sky(self) -> None:

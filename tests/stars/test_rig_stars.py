@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
+from command_line import ran
 
 from kcal import DegenerateError, InputError, Landmarks, RigOptions, load_rig, save_camera, solve_rig
-from kcal.cli.main import app
 from kcal.io.images import write_png
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.locate import enu_from_cam
@@ -143,9 +142,8 @@ def test_the_command(tmp_path: Path) -> None:
         "--refraction", "0±0",
     ]  # fmt: skip
     stars = ["--stars", str(tmp_path / "left"), str(tmp_path / "right"), "--json"]
-    place = ["--time", "name:Z", "--site", f"{PLACE.lat},{PLACE.lon},{PLACE.height}", "--dut1", "0"]
-    for more in (place, []):
-        done = CliRunner().invoke(app, [*common, *stars, *more, "-o", str(tmp_path / "rig.json")])
+    for more in (["--time", "name:Z", "--site", f"{PLACE.lat},{PLACE.lon},{PLACE.height}", "--dut1", "0"], []):
+        done = ran(*common, *stars, *more, "-o", tmp_path / "rig.json")
         assert done.exit_code == 0, done.output
         rig = load_rig(tmp_path / "rig.json")
         error = vector_from_rotation(rig.right_from_left_rotation @ (truth[1] @ truth[0].T).T)
@@ -154,6 +152,6 @@ def test_the_command(tmp_path: Path) -> None:
         assert (rig.mounting is not None) == bool(more)
         if more:
             assert rig.mounting.heading_deg == pytest.approx(LOOKS[0][0], abs=0.004)
-    done = CliRunner().invoke(app, [*common[:3], "--baseline", "10±0.002", *stars, "-o", str(tmp_path / "no.json")])
+    done = ran(*common[:3], "--baseline", "10±0.002", *stars, "-o", tmp_path / "no.json")
     assert "add matches of unknown range" in str(done.exception)
     assert not (tmp_path / "no.json").exists()

@@ -295,8 +295,7 @@ class TestPosterior:
         far = zero.clone()
         far[4] = 6.0
         best = far / told**2 / (1 / told**2 + 1.0)
-        stars = torch.cat([eye / told, ((best - far) / told)[:, None]], 1)
-        found = _agreement_with(stars, best, known, 50, 0.3)
+        found = _agreement_with(torch.cat([eye / told, ((best - far) / told)[:, None]], 1), best, known, 50, 0.3)
         chi2 = 36.0 / (1 + told**2)
         assert found.freedom == count
         assert found.by_chance == pytest.approx(2 * count * stats.chi2.sf(chi2, 1))
@@ -355,8 +354,7 @@ class TestProblem:
             begin[:2] += 5.0
             spread = tensor(sigma, 1e3)
             prior = GaussianPrior(index, begin[index], 1.0 / spread)
-            known = GaussianTerm(index, Gaussian.independent(("f", "x"), begin[index], spread), 1.0)
-            for term in (prior, known):
+            for term in (prior, GaussianTerm(index, Gaussian.independent(("f", "x"), begin[index], spread), 1.0)):
                 problem = stars.problem(camera.model, unknowns, [term])
                 result = minimize(problem, state._replace(parameters=begin), LMOptions(max_iterations=20))
                 found = result.state.parameters
@@ -416,10 +414,8 @@ class TestRoughLens:
         known = np.flatnonzero(named.star >= 0)
         assert len(known) >= 5
         assert named.star[known].tolist() == index[known].tolist()
-        away = np.linalg.norm(seen.pixels[known] - [479.5, 299.5], axis=1)
-        assert away.max() < 0.25 * math.hypot(*self.SIZE)
-        few = seen._replace(pixels=seen.pixels[:4])
-        assert _search(few, _plain_cameras(self.SIZE, 900.0), *self.HOW) is None
+        assert np.linalg.norm(seen.pixels[known] - [479.5, 299.5], axis=1).max() < 0.25 * math.hypot(*self.SIZE)
+        assert _search(seen._replace(pixels=seen.pixels[:4]), _plain_cameras(self.SIZE, 900.0), *self.HOW) is None
 
     def test_names_by_a_camera(self) -> None:
         seen, index = self.seen()

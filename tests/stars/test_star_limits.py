@@ -67,8 +67,7 @@ class TestPoints:
         """By their variances over that of the window, 1.69 px², and half as wide as long at least."""
         moments = WIDTH**2 * np.array([[xx, yy, xy], *[[0.4, 0.4, 0.0]] * 4])
         boxes = np.stack([star(0.0, 0.0, np.eye(2))] * 5)
-        found = _reasons(boxes, 7, np.zeros((5, 2)), moments, np.zeros(5, bool))
-        assert found.tolist() == [why, "", "", "", ""]
+        assert _reasons(boxes, 7, np.zeros((5, 2)), moments, np.zeros(5, bool)).tolist() == [why, "", "", "", ""]
 
     def test_in_long_exposures_half_as_round_as_usual(self) -> None:
         moments = WIDTH**2 * np.array([[0.4, 0.4 * share, 0.0] for share in (0.3, 0.3, 0.3, 0.16, 0.14)])
@@ -134,8 +133,7 @@ class TestTurns:
         np.testing.assert_allclose(turn_between(self.RAYS, self.RAYS @ turn.T), turn, atol=1e-12)
         several = turn_between(np.stack([self.RAYS, self.RAYS @ turn.T]), self.RAYS)
         np.testing.assert_allclose(several, [np.eye(3), turn.T], atol=1e-12)
-        mirrored = turn_between(self.RAYS, self.RAYS * [-1.0, 1.0, 1.0])
-        assert float(np.linalg.det(mirrored)) == pytest.approx(1.0)
+        assert float(np.linalg.det(turn_between(self.RAYS, self.RAYS * [-1.0, 1.0, 1.0]))) == pytest.approx(1.0)
 
     def test_angles_and_the_middle(self) -> None:
         x, y = np.array([1.0, 0.0, 0.0]), np.array([math.cos(0.3), math.sin(0.3), 0.0])

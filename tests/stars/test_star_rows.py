@@ -156,16 +156,14 @@ def test_on_the_earth_the_clock_and_the_air_are_unknown() -> None:
     found = source(moments, origin=PLACE)
     names = [effect.name for effect in found.effects]
     assert names[1:] == ["the clocks against UT1", "the air's temperature", "the air's pressure"]
-    turns = turns_of_one(found)[1]
-    assert turns.numpy() == pytest.approx(np.stack([0.3 * -EARTH_RATE * pole_in_enu(45.0)] * 2))
+    assert turns_of_one(found)[1].numpy() == pytest.approx(np.stack([0.3 * -EARTH_RATE * pole_in_enu(45.0)] * 2))
     by_camera = found.shifts()
     shifts = by_camera[:, :, 0]
     assert torch.equal(by_camera[:, :, 1], shifts)
     assert bool((shifts[:2] == 0).all())
     for effect in (0, 1):
         for k, h in enumerate((0.0, 0.5)):
-            view = image([[1, 1]], [7], hours=h, earth=True).view
-            wanted = view.by_air(CATALOG, np.array([7, 9]))[effect][1]
+            wanted = image([[1, 1]], [7], hours=h, earth=True).view.by_air(CATALOG, np.array([7, 9]))[effect][1]
             assert shifts[2 + effect, 2 * k : 2 * k + 2].numpy() == pytest.approx(wanted, abs=1e-15)
     assert float(shifts[2:].abs().max()) > 0
 

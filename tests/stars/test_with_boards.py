@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
+from command_line import ran
 
 from kcal import CalibrationOptions, Camera, InputError, calibrate_camera, load_camera
 from kcal.calibrate.camera.result import CameraCalibrationResult
-from kcal.cli.main import app
 from kcal.io.images import write_png
 from kcal.sim.captures import drawn_lens
 from kcal.stars import SkyView
@@ -117,13 +116,13 @@ def test_the_command(night: Night, tmp_path: Path) -> None:
     output = tmp_path / "left.camera.json"
     command = ["calibrate", str(tmp_path / "left.obs.json"), "--stars", str(folder), "--time", "name:Z", "--json"]
     command += ["--site", f"{PLACE.lat},{PLACE.lon},{PLACE.height}"]
-    done = CliRunner().invoke(app, [*command, "-o", str(output)])
+    done = ran(*command, "-o", output)
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)
     assert told["agreement"]["by_chance"] > 1e-4
     assert len(told["images"]) == 3
     assert error_at_infinity(load_camera(output), true_lens()).rms < 0.1
-    two = CliRunner().invoke(app, [command[0], command[1], command[1], *command[2:], "-o", str(tmp_path / "two")])
+    two = ran(command[0], command[1], command[1], *command[2:], "-o", tmp_path / "two")
     assert "--stars are of one camera" in str(two.exception)
 
 
@@ -274,14 +273,12 @@ def test_six_real_images(tmp_path: Path) -> None:
     """Names, lens and attitude on the Earth of a camera of which only time and place are known."""
     camera = tmp_path / "camera.json"
     place = ["--time", "name:Z"]
-    done = CliRunner().invoke(
-        app, ["calibrate", "--stars", str(REAL), *place, "--site", "52,4.37,0", "-o", str(camera)]
-    )
+    done = ran("calibrate", "--stars", REAL, *place, "--site", "52,4.37,0", "-o", camera)
     assert done.exit_code == 0, done.output
     assert float(load_camera(camera).params[0]) == pytest.approx(5117, abs=3)
     picture = tmp_path / "named.png"
     where = ["--site", "52,4.37,0", "--picture", str(picture), "--json"]
-    done = CliRunner().invoke(app, ["stars", str(REAL), "--camera", str(camera), *place, *where])
+    done = ran("stars", REAL, "--camera", camera, *place, *where)
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)["images"]
     assert len(told) == 6

@@ -168,8 +168,7 @@ class TestFeatures:
     def test_features_of_known_range_tell_the_relative_turn_without_a_history(self) -> None:
         turns = TURN * tensor([0.0], [1.0])
         features = static(15, turns=turns)
-        points = spread_points(15, 300.0, 8000.0, 11)
-        inverse = 1.0 / torch.linalg.vector_norm(points - CENTER[:2].mean(0), dim=-1)
+        inverse = 1.0 / torch.linalg.vector_norm(spread_points(15, 300.0, 8000.0, 11) - CENTER[:2].mean(0), dim=-1)
         pixels = features.pixels.clone()
         pixels[:, :2] = math.nan
         known = dataclasses.replace(features, pixels=pixels, inverse_range=inverse, inverse_range_sigma=1e-3 * inverse)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from batch_crew import Here
-from typer.testing import CliRunner
+from command_line import invoked, ran
 from waiting import wait_for
 
 from kcal import Board, Camera, DegenerateError, FileError, InputError, KcalError, Observations
@@ -31,7 +31,6 @@ from kcal.calibrate.batch.results import (
     run_tasks,
     write_summary,
 )
-from kcal.cli.main import app
 from kcal.io.camera_file import CameraFile, load_camera
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.sim.scene import RenderOptions, render_board
@@ -39,10 +38,6 @@ from kcal.threads import in_one_thread
 
 BOARD = Board(columns=6, rows=5, square=0.02)
 WHAT = ("--board", "6x5", "--square", "20mm")
-
-
-def kcal(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -111,8 +106,8 @@ class TestResults:
         assert [(row.camera, row.status, row.views) for row in first] == [("east", "ok", 4), ("west", "ok", 4)]
         for name in ("east", "west"):
             single = place / f"{name}.obs.json"
-            assert kcal("detect", folder / name, *WHAT, "-o", single).exit_code == 0
-            assert kcal("calibrate", single, "-o", place / f"{name}.camera.json", "--model", "opencv5").exit_code == 0
+            invoked("detect", folder / name, *WHAT, "-o", single)
+            invoked("calibrate", single, "-o", place / f"{name}.camera.json", "--model", "opencv5")
             assert Observations.load(place / "out" / f"{name}.obs.json") == Observations.load(single)
             ours = CameraFile.load(place / "out" / f"{name}.camera.json")
             other = CameraFile.load(place / f"{name}.camera.json")
@@ -243,11 +238,11 @@ class TestSharing:
         # Once more, nothing is left to do: of each camera four images, the calibration alone, and that with both.
         monkeypatch.setattr(Pool, "submit", lambda _, task: crew.submit(task))
         before = len(crew.tasks)
-        again = kcal("batch", folder, *WHAT, "-o", out)
+        again = ran("batch", folder, *WHAT, "-o", out)
         assert (again.exit_code, len(crew.tasks)) == (0, before)
         assert "12 of 12 pieces of work were there already" in again.output
         (folder / "empty").mkdir()
-        result = kcal("batch", folder, *WHAT, "-o", out)
+        result = ran("batch", folder, *WHAT, "-o", out)
         assert result.exit_code == 1
         assert "1 of 3 cameras failed: empty" in str(result.exception)
         assert "4 of 4" in result.output
@@ -257,7 +252,7 @@ class TestSharing:
 
 def test_refusals_of_the_command(folder, place):
     for words, message in (("--board 6x5", "give the side of its squares"), ("--square 1 --model best", "model")):
-        assert message in str(kcal("batch", folder, *words.split(), "-o", place / "none").exception)
+        assert message in str(ran("batch", folder, *words.split(), "-o", place / "none").exception)
     assert not (place / "none").exists()
 
 
@@ -387,7 +382,7 @@ def test_dask(folder, first, place):
         n_workers=1, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None
     ) as cluster:
         plain = [*WHAT, "--model", "opencv5"]
-        result = kcal("batch", folder, *plain, "-o", place / "new", "--scheduler", cluster.scheduler_address)
+        result = ran("batch", folder, *plain, "-o", place / "new", "--scheduler", cluster.scheduler_address)
     assert result.exit_code == 0, result.exception
     rows = list(csv.DictReader((place / "new" / "summary.csv").open()))
     assert [float(row["rms"]) for row in rows] == pytest.approx([row.rms for row in first], rel=1e-6)

@@ -76,8 +76,7 @@ def outcomes(crew: Crew, count: int, more: int = 0) -> dict[int, Any]:
 
 def test_all_is_done_and_few_tasks_wait() -> None:
     crew = Crew(3)
-    found = outcomes(crew, 10, more=4)
-    assert found == {**{i: divmod(i, 3) for i in range(10)}, **{100 + i: i for i in range(4)}}
+    assert outcomes(crew, 10, more=4) == {**{i: divmod(i, 3) for i in range(10)}, **{100 + i: i for i in range(4)}}
     assert crew.most == 3
     # What was added comes before what is left.
     assert crew.tried.index(100) < crew.tried.index(9)

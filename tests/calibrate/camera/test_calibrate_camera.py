@@ -47,8 +47,7 @@ class TestNoiseFree:
         assert result.rms < 1e-11
         assert result.warnings == ()
         assert far_apart(result.camera, truth) < 1e-8
-        expected = truth.params.detach()
-        torch.testing.assert_close(result.camera.params.detach(), expected, rtol=digits, atol=digits)
+        torch.testing.assert_close(result.camera.params.detach(), truth.params.detach(), rtol=digits, atol=digits)
         torch.testing.assert_close(result.cam_from_board_rotation, poses[0], rtol=0, atol=1e-9)
         torch.testing.assert_close(result.cam_from_board_translation, poses[1], rtol=0, atol=1e-9)
         assert float(result.camera.params[4]) == 0.0
@@ -126,8 +125,7 @@ class TestNumbers:
         torch.testing.assert_close(result.per_view_rms, squared.nanmean(-1).sqrt(), rtol=1e-10, atol=0)
         # Noise of 0.3 px an axis, less what the parameters took: E rms² = 2 σ² (1 - p / n), within 4 standard errors.
         count = int(torch.isfinite(pixels).sum())
-        expected = 0.3 * (2 * (1 - (9 + 48) / count)) ** 0.5
-        assert result.rms == pytest.approx(expected, rel=4 / (2 * count) ** 0.5)
+        assert result.rms == pytest.approx(0.3 * (2 * (1 - (9 + 48) / count)) ** 0.5, rel=4 / (2 * count) ** 0.5)
 
     @pytest.mark.slow
     def test_nested_models_never_end_higher(self) -> None:
@@ -161,8 +159,7 @@ class TestNumbers:
         problem = BoardProblem(BOARD.points, pixels.double(), truth.model, free_parameters(truth.model))
         linear = problem.linearize(as_state(result))
         variance = noise_variance(linear, problem.residual_count, problem.shared_size + 6 * len(pixels))
-        sigmas = uncertainty_of(linear, float(variance)).sigma
-        for name, sigma in zip(result.sigma, sigmas.tolist(), strict=True):
+        for name, sigma in zip(result.sigma, uncertainty_of(linear, float(variance)).sigma.tolist(), strict=True):
             # As above.
             assert sigma == pytest.approx(known[name], rel=1e-5 if model == "opencv5" else 1e-3), name
             # What is reported is no less: of eight coefficients it includes the difference to a weak prior's solution.

@@ -81,8 +81,7 @@ def unequal(factor: float, board: Board, roll: float = math.pi, aspect: float = 
         u = 2.0 * torch.rand(6, generator=generator, dtype=torch.float64) - 1.0
         tilt = rotation_from_vector(torch.stack([0.6 * u[0], 0.6 * u[1], 0.0 * u[0]]))
         rotation = tilt @ rotation_from_vector(roll * u[2] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-        center = torch.stack([0.08 * u[3], 0.05 * u[4], 0.45 + 0.1 * u[5]])
-        pixels = camera.project(points @ rotation.T + center)[0]
+        pixels = camera.project(points @ rotation.T + torch.stack([0.08 * u[3], 0.05 * u[4], 0.45 + 0.1 * u[5]]))[0]
         noisy = pixels + 0.05 * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
         views.append(torch.where(camera.inside(noisy)[:, None], noisy, torch.nan))
     return observe(torch.stack(views), board=board, size=camera.size)

@@ -8,15 +8,14 @@ import cv2
 import pytest
 import torch
 from calibrate_scenes import SIZE, camera, corner_pixels, observe
+from command_line import invoked as run
 from lenses import HYBRID, strong
 from printed_boards import printed_views
-from typer.testing import CliRunner
 
 from kcal import Board, CalibrationOptions, Camera, DegenerateError, InputError, Observations, calibrate_camera
 from kcal.calibrate.camera.advice import possible_views
 from kcal.calibrate.camera.at_setting import ComparisonResult, compare_models
 from kcal.calibrate.camera.checks import OutlierRejection
-from kcal.cli.main import app
 from kcal.corners.marker_boards import _opencv_board
 from kcal.io.camera_file import CameraFile, load_camera, save_camera
 from kcal.lens import camera_difference, refit_camera
@@ -232,12 +231,6 @@ def photographs(folder, paper, distance, shift):
             CAMERA, *pose(paper.board, tilt, distance * (1.15 if i % 3 else 1.0), place), seed=i, supersample=3
         )
         cv2.imwrite(f"{folder}/{i}.png", image)
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 @pytest.mark.slow

@@ -43,8 +43,7 @@ def covariance_of(prior: dict[str, Any]) -> np.ndarray:
 @pytest.mark.parametrize("name", [name for name in FORMATS if "opencv4" in FORMATS[name].models])
 def test_the_covariance_comes_back_from_every_program(tmp_path: Path, name: str) -> None:
     subject = known(camera())
-    file = {"numpy": "a.npz", "bag": "a.mcap"}.get(name, "a.json")
-    done = export_cameras(subject, tmp_path / file, format=name)
+    done = export_cameras(subject, tmp_path / {"numpy": "a.npz", "bag": "a.mcap"}.get(name, "a.json"), format=name)
     assert "error bars" not in done.lost
     (back,) = import_cameras(done.paths[-1]).cameras
     assert back.calibration.name == "north"

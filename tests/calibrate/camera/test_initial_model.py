@@ -103,8 +103,7 @@ def test_a_real_lens_of_150_degrees(kcal_data: Path) -> None:
         corners, weight = data["corners"][number], data["weight"][number]
         pixels = tuple((float(u), float(v)) if w > 0 else None for (u, v), w in zip(corners, weight, strict=True))
         views.append(View(name=str(number), pixels=pixels))
-    board = Board(columns=10, rows=10, square=0.077)
-    seen = Observations(board=board, image_size=(6016, 4016), views=tuple(views))
+    seen = Observations(board=Board(columns=10, rows=10, square=0.077), image_size=(6016, 4016), views=tuple(views))
     result = calibrate_camera(seen, CalibrationOptions(weak_prior=None, model="opencv8", board_warp=True))
     known = data["seed_intrinsics_fx_fy_cx_cy"]
     # Another program's solution of twice the views; the data's own spread is a few tenths of a percent.

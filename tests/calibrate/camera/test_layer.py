@@ -66,8 +66,7 @@ def test_derivatives_are_those_of_solving_anew(options: CalibrationOptions) -> N
             value + torch.tensordot(amount, along, 1)
             for value, along in zip((corners, BOARD.points, means), directions, strict=True)
         ]
-        found = calibrate_views(data[0], data[1], SIZE, options, prior_means=data[2], start=base)
-        return summary(found)
+        return summary(calibrate_views(data[0], data[1], SIZE, options, prior_means=data[2], start=base))
 
     # Central differences over 1e-4 px of solutions that are exact to some 1e-11 px.
     zero = torch.zeros(3, dtype=torch.float64, requires_grad=True)

@@ -51,8 +51,7 @@ def test_it_gives_what_it_promises(model: str, monkeypatch: pytest.MonkeyPatch) 
     assert found.sigma < 0.98 * far_sigma(camera)
     assert min(promised) == promised[0]
     # Once it is taken, the next one is asked for, without a new calibration; a view without a pose tells nothing.
-    nothing = torch.full_like(found.pixels, torch.nan)
-    then = next_view(camera, BOARD, noise, torch.stack([found.pixels, nothing]))
+    then = next_view(camera, BOARD, noise, torch.stack([found.pixels, torch.full_like(found.pixels, torch.nan)]))
     again = next_view(camera, BOARD, noise, found.pixels[None].repeat(2, 1, 1))
     after.calibration = CameraCalibration(information=informed[0])
     known_then = next_view(after, BOARD, noise)

@@ -143,8 +143,7 @@ class TestRig:
             [board] * 13, *corners, *lenses, SIZE, flags=cv2.CALIB_FIX_INTRINSIC, criteria=STEPS
         )
         assert result.rms == pytest.approx(rms, rel=1e-6)
-        baseline = float((translation**2).sum() ** 0.5)
-        assert float(result.stereo().baseline) == pytest.approx(baseline, rel=1e-6)
+        assert float(result.stereo().baseline) == pytest.approx(float((translation**2).sum() ** 0.5), rel=1e-6)
         found = result.stereo().right_from_left_rotation
         torch.testing.assert_close(found, torch.from_numpy(rotation).double(), rtol=0, atol=1e-6)
 

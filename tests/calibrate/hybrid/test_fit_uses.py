@@ -142,8 +142,7 @@ class TestStarts:
         """Of 61 views every second one tells the projection, and all get poses."""
         there = places(61)
         truth = Camera.build(focal=(800, 800 * ratio), center=(644, 476), size=SIZE, model="pinhole")
-        pixels = truth.project(there)[0]
-        base = fit_projection(BOARD.points, pixels, SIZE, torch.ones(61, 48), square=ratio == 1.0)
+        base = fit_projection(BOARD.points, truth.project(there)[0], SIZE, torch.ones(61, 48), square=ratio == 1.0)
         assert base.focal == pytest.approx(800.0, rel=1e-4)
         assert (base.aspect is None) if ratio == 1.0 else (base.aspect == pytest.approx(ratio, rel=1e-4))
         cam = BOARD.points @ base.state.rotation.mT + base.state.translation[:, None]
@@ -159,16 +158,14 @@ class TestStarts:
             assert fit_projection(BOARD.points, pixels, SIZE, ones, known_focal=told).focal == pytest.approx(
                 free, rel=1e-2
             )
-        exact = fit_projection(BOARD.points, pixels, SIZE, ones, known_focal=700.0, exact_focal=True)
-        assert exact.focal == 700.0
+        assert fit_projection(BOARD.points, pixels, SIZE, ones, known_focal=700.0, exact_focal=True).focal == 700.0
 
     def test_a_lens_of_a_known_type(self) -> None:
         """Its form and modes are those of the type, and it is found as without."""
         fit = fitted()
         form = fit.model.hybrid
         assert form is not None
-        usual = typical_lens(form, fit.families, fit.expected, True)
-        lens = LensPrior(form, float(fit.families.mean[0]), usual)
+        lens = LensPrior(form, float(fit.families.mean[0]), typical_lens(form, fit.families, fit.expected, True))
         again = fit_hybrid(BOARD.points, shots(), SIZE, options=FitOptions(board="exact", motion=False, lens=lens))
         assert again.model.hybrid == form
         sigma = fit.half.square().sum(0).sqrt()[:3]
@@ -180,8 +177,7 @@ class TestStarts:
 class TestTypes:
     def camera(self, focal: float, *, square: bool = True) -> CameraFit:
         form = HybridForm(shape=focal / 1e4, radius=0.7, modes=MODES)
-        board = board_modes(BOARD.points)
-        families = prior_families(form, focal + 1.0, board, SIZE, 0.6, None if square else 1.1)
+        families = prior_families(form, focal + 1.0, board_modes(BOARD.points), SIZE, 0.6, None if square else 1.1)
         state = SimpleNamespace(parameters=torch.tensor([focal, focal, 0.0, 0.0]))
         camera = SimpleNamespace(model=SimpleNamespace(hybrid=form))
         typical = typical_hyperprior().mean
@@ -242,8 +238,7 @@ class TestBoards:
             nats: float = math.nan
 
         begin = torch.tensor([0, 2, 2])
-        seen = Camera(turned(message, turn) if turn else message, begin, fit)
-        found = compared(cast(Any, seen), known, BOARD)
+        found = compared(cast(Any, Camera(turned(message, turn) if turn else message, begin, fit)), known, BOARD)
         assert torch.equal(found.turns, (begin + turn) % 4)
         assert found.board == 0
         wanted = evidence(known, [message]) - printed_board(fit.board_shapes, [message])[1]
@@ -295,8 +290,7 @@ def test_motion_is_looked_for_again_where_the_aspect_may_have_hidden_it(monkeypa
 @pytest.mark.parametrize(("views", "kept"), [(5, True), (6, False)])
 def test_few_views_do_not_tell_that_they_stood_still(views: int, kept: bool) -> None:
     """They keep the motion of a hand, which six views that stood still lose, and error bars for what is open of it."""
-    options = FitOptions(modes=MODES, board="exact", square=True)
-    fit = fit_hybrid(BOARD.points, shots(views), SIZE, options=options)
+    fit = fit_hybrid(BOARD.points, shots(views), SIZE, options=FitOptions(modes=MODES, board="exact", square=True))
     assert (fit.motion_sigma is not None, fit.wider > 1.01) == (kept, kept)
     if fit.motion_sigma is not None:
         assert abs(math.log(fit.motion_sigma.turn / HAND[0])) < 3.0 * HAND_SPREAD

@@ -92,8 +92,7 @@ def turn() -> tuple[_Turn, Estimate]:
     pixels = capture(6).pixels()
     options = FitOptions(modes=NetworkModes.of(Rings())[0], board="exact", motion=False)
     found = settle(BOARD.points, pixels, SIZE, torch.ones_like(pixels[..., 0]), options)
-    flat = weights_of(_trunk(found.estimate))
-    return _Turn(capture=found.capture, initial=flat, spread=0.5), found.estimate
+    return _Turn(capture=found.capture, initial=weights_of(_trunk(found.estimate)), spread=0.5), found.estimate
 
 
 def test_derivatives_by_the_networks_weights() -> None:

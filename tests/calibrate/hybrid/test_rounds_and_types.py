@@ -166,8 +166,7 @@ def test_what_a_camera_tells_of_its_lens(shape: Any, monkeypatch: pytest.MonkeyP
     fit = found.fit
     deviation, count = fit.families.deviation(fit.expected), len(found.lens.slots)
     assert found.lens.slots == numbered(LENS_SLOT, count)
-    prior = Gaussian.independent(found.lens.slots, fit.families.mean[:count], deviation[:count])
-    both = found.lens + prior
+    both = found.lens + Gaussian.independent(found.lens.slots, fit.families.mean[:count], deviation[:count])
     wanted = fit.state.parameters[[0, 2, 3]]
     mean, half = both.mean_and_half()
     off = (mean[:3] - wanted) / half.square().sum(0).sqrt()[:3]

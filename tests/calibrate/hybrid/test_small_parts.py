@@ -288,8 +288,7 @@ def test_deviations_and_their_slopes() -> None:
         0 * one, tensor(0.1, 0.2, 0.3), torch.tensor([0, -1, 1]), torch.tensor([1, -1, -1]), 2 * one
     )
     h = tensor(0.4, -0.5)
-    wanted = [0.1 + 0.4 - math.exp(-0.5) * 2.0, 0.2, 0.3 - 0.5]
-    assert families.deviation(h).log().tolist() == pytest.approx(wanted)
+    assert families.deviation(h).log().tolist() == pytest.approx([0.1 + 0.4 - math.exp(-0.5) * 2.0, 0.2, 0.3 - 0.5])
     first, second = families.log_variance_slopes(h)
     for k in (0, 1):
         step = 1e-6 * torch.eye(2).double()[k]

@@ -68,8 +68,7 @@ def by_autograd(problem: BoardProblem, state: BoardState) -> Tensor:
     # by_local is (V, R, V, 6): a view's residuals depend on its own pose alone.
     for v, w in itertools.permutations(range(VIEWS), 2):
         assert bool((by_local[v, :, w] == 0).all())
-    own = torch.stack([by_local[v, :, v].T for v in range(VIEWS)])
-    return torch.cat([own, by_shared.transpose(-1, -2)], -2)
+    return torch.cat([torch.stack([by_local[v, :, v].T for v in range(VIEWS)]), by_shared.transpose(-1, -2)], -2)
 
 
 def by_differences(problem: BoardProblem, state: BoardState) -> Tensor:
@@ -209,8 +208,7 @@ class TestResiduals:
 
 def test_tidy_only_rounds() -> None:
     pixels, model, state = scene("opencv5")
-    problem = BoardProblem(BOARD.points, pixels, model)
-    tidied = problem.tidy(state._replace(rotation=state.rotation * (1 - 1e-9)))
+    tidied = BoardProblem(BOARD.points, pixels, model).tidy(state._replace(rotation=state.rotation * (1 - 1e-9)))
     for before, after in zip(state, tidied, strict=True):
         torch.testing.assert_close(after, before, rtol=0, atol=1e-14)
 

@@ -122,8 +122,7 @@ def test_what_is_told_of_motions_is_that_of_all_rows(shared: int) -> None:
     data, families = rig.told(1, moving)
     rows = torch.zeros(views, 6 + 12 + shared + 1, 2 * corners, dtype=F64)
     for c, part in enumerate(parts):
-        columns = [*range(6), *(18 + own[c]).tolist(), 18 + shared]
-        rows[:, columns, c * corners : (c + 1) * corners] = part.rows
+        rows[:, [*range(6), *(18 + own[c]).tolist(), 18 + shared], c * corners : (c + 1) * corners] = part.rows
     rows[:, 6:18, corners:] = moving
     off = without_local(rows, 6)
     counts = float(views * (2 * corners - 6))

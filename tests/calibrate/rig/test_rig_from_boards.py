@@ -396,8 +396,7 @@ class TestRefusals:
                 solve(seen, left=sides[0], right=sides[1])
 
     def test_nearly_equal_cameras_are_not_called_swapped_for_noise(self) -> None:
-        pixels = views(5, 1, noise=0.3)
-        assert solve(pixels, right=Camera(RIGHT.params * (1 + 1e-5), size=SIZE)).left_out == ()
+        assert solve(views(5, 1, noise=0.3), right=Camera(RIGHT.params * (1 + 1e-5), size=SIZE)).left_out == ()
 
     def test_another_camera(self) -> None:
         other = Camera.build(focal=(1200, 600), center=(320, 240), size=SIZE)

@@ -184,8 +184,7 @@ class TestPoses:
     def test_the_relative_pose_of_most_pairs(self, turned: tuple[int, ...]) -> None:
         """Some boards read from the other end, one that moved between both exposures by 0.2 m across."""
         relative = Pose(ROTATION[1] @ ROTATION[0].T, ROTATION[1] @ (CENTER[0] - CENTER[1]))
-        turns = rotation_from_vector(0.3 * normal((8, 3), 3))
-        left = Pose(turns, tensor(-1.0, -1.0, 20.0) + normal((8, 3), 4))
+        left = Pose(rotation_from_vector(0.3 * normal((8, 3), 3)), tensor(-1.0, -1.0, 20.0) + normal((8, 3), 4))
         right = relative.after(left)
         right.translation[3] += tensor(0.2, 0.0, 0.0)
         pixels = torch.stack([
