@@ -8,9 +8,10 @@ import cv2
 import pytest
 import torch
 from command_line import Command, invoked, ran, rows_of
+from rig_scenes import CAMERAS, spread_points
 from torch import Tensor
 
-from kcal import Camera, KcalError, Origin
+from kcal import KcalError, Origin
 from kcal.cli.rig_sources import Sources, read_sources
 from kcal.io.camera_file import camera_to_file, save_camera
 from kcal.io.images import write_png
@@ -28,11 +29,6 @@ from tests.helpers.skyline_site import camera, heights, small_site, write_raster
 
 ORIGIN = Origin(lat=-17.5, lon=179.9999, height=40.0)
 
-CAMERAS = [
-    Camera.build(focal=(1602, 1600), center=(968, 534), size=(1920, 1080), coefficients=[-0.2, 0.06, 3e-4, -2e-4]),
-    Camera.build(focal=(1611, 1610), center=(951, 546), size=(1920, 1080), coefficients=[-0.19, 0.05, -2e-4, 3e-4]),
-]
-
 ROTATION = [enu_from_cam(16.0, -0.5, 0.4).T, enu_from_cam(16.2, -0.3, -0.2).T]
 
 CENTER = torch.tensor([[2.0, -1.0, 3.0], [11.6, -3.7, 3.1]], dtype=torch.float64)
@@ -41,11 +37,7 @@ HEADER = "name,left_u,left_v,right_u,right_v"
 
 
 def points(count: int, near: float, far: float, seed: int) -> Tensor:
-    draw = torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    distance = near * (far / near) ** draw[:, :1]
-    across, up = 0.7 * (draw[:, 1:2] - 0.5), 0.4 * (draw[:, 2:] - 0.5)
-    right, down, ahead = ROTATION[0]
-    return CENTER[0] + distance * (ahead + across * right - up * down)
+    return spread_points(count, near, far, seed, ROTATION[0], CENTER[0])
 
 
 def marked(where: Tensor, seed: int, yaw: float = 0.0) -> Tensor:
@@ -67,7 +59,7 @@ def marks_table(path: Path, prefix: str, pixels: Tensor, header: str = HEADER, *
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    for name, one in zip(("left", "right"), CAMERAS, strict=True):
+    for name, one in zip(("left", "right"), CAMERAS[:2], strict=True):
         camera_to_file(one, name=name).save(tmp_path / f"{name}.json")
     posts = points(12, 60.0, 2000.0, 5)
     places = enu_to_geodetic(posts, ORIGIN)

@@ -41,12 +41,12 @@ PLACE = Origin(lat=10.0, lon=20.0, height=0.0)
 
 
 @functools.cache
-def located(heading: float = 300.0) -> tuple[Located, torch.Tensor]:
+def located(heading: float = 300.0, mast: str = "mast", origin: Origin = PLACE) -> tuple[Located, torch.Tensor]:
     """Four things, the last too far for a range, and their true places."""
     left, right = pinhole_rig()(PLACES)[0].unbind(-2)
-    names = ["gate", "mast", "ship", "cloud"]
+    names = ["gate", mast, "ship", "cloud"]
     found = located_pairs(
-        pinhole_rig(), left, right + tensor([0.3, 0.0]), origin=PLACE, heading_deg=heading, names=names
+        pinhole_rig(), left, right + tensor([0.3, 0.0]), origin=origin, heading_deg=heading, names=names
     )
     return found, PLACES @ enu_from_cam(heading).T
 
@@ -159,9 +159,9 @@ def checked(repeats: int = 20) -> IntervalCheck:
     return IntervalCheck(pixels=pixels, ranges=(10.0, math.inf), stated=stated, errors=errors, failed=0)
 
 
-def bent() -> MeasuredBoard:
+def bent(scale: float = 2e-4) -> MeasuredBoard:
     amplitudes = torch.zeros(28, dtype=torch.float64)
-    amplitudes[1], amplitudes[12] = 2e-4, 2e-4
+    amplitudes[1], amplitudes[12] = scale, scale
     board = Board(columns=6, rows=9, square=0.02)
     return MeasuredBoard(name="plate", board=board, amplitudes=amplitudes, half=1e-5 * torch.eye(28).double(),
                          log_evidence=0.0)  # fmt: skip

@@ -54,13 +54,27 @@ def normal(shape: object, seed: int) -> Tensor:
     return torch.randn(shape, dtype=torch.float64, generator=generator(seed))  # type: ignore[call-overload]
 
 
-def spread_points(count: int, near: float, far: float, seed: int) -> Tensor:
-    """Points in the common view, log-uniform in range, from below to above the horizon."""
+def spread_points(
+    count: int, near: float, far: float, seed: int, along: Tensor = ROTATION[0], center: Tensor = CENTER[0]
+) -> Tensor:
+    """Points in view of a camera, log-uniform in range, from below to above the horizon."""
     draw = torch.rand(count, 3, dtype=torch.float64, generator=generator(seed))
     distance = near * (far / near) ** draw[:, :1]
     across, up = 0.7 * (draw[:, 1:2] - 0.5), 0.4 * (draw[:, 2:] - 0.5)
-    along = ROTATION[0]
-    return CENTER[0] + distance * (along[2] + across * along[0] - up * along[1])
+    return center + distance * (along[2] + across * along[0] - up * along[1])
+
+
+def posts(
+    truth: Tensor, pixels: Tensor, *, noise: float, error: float, survey: float, sigma: float, seeds: tuple[int, int]
+) -> Landmarks:
+    """Surveyed points (N, 3) off by `error` m, which claims `survey` m, and marks off by `noise` px, of `sigma` px."""
+    return Landmarks(
+        names=tuple(f"post {i}" for i in range(len(truth))),
+        points=truth + error * normal(truth.shape, seeds[0]),
+        sigma=torch.full(truth.shape, survey, dtype=torch.float64),
+        pixels=pixels + noise * normal(pixels.shape, seeds[1]),
+        pixel_sigma=sigma,
+    )
 
 
 def landmarks(
@@ -69,13 +83,8 @@ def landmarks(
     """Surveyed points from 60 m to 2 km; `noise` px on the marks, `error` m on the survey, which claims `survey` m."""
     truth = spread_points(count, 60.0, 2000.0, 5)
     pixels = torch.stack([see(truth, c) for c in range(cameras)], 1)
-    return Landmarks(
-        names=tuple(f"post {i}" for i in range(count)),
-        points=truth + error * normal(truth.shape, 100 + seed),
-        sigma=torch.full((count, 3), survey, dtype=torch.float64),
-        pixels=pixels + noise * normal(pixels.shape, 200 + seed),
-        pixel_sigma=max(noise, 0.1),
-    )
+    seeds, sigma = (100 + seed, 200 + seed), max(noise, 0.1)
+    return posts(truth, pixels, noise=noise, error=error, survey=survey, sigma=sigma, seeds=seeds)
 
 
 def features(

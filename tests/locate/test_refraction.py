@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, normal, spread_points
+from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, normal, posts, spread_points
 from torch import Tensor
 
 from kcal import InputError, Landmarks, Localizer, Origin, RigData, RigOptions, load_rig, save_rig, solve_rig
@@ -25,19 +25,14 @@ def bent(points: Tensor, camera: int, k: float) -> Tensor:
     return CAMERAS[camera].project((away + lift * UP) @ ROTATION[camera].T)[0]
 
 
-def posts(
+def lifted(
     k: float, *, far: float = 5000.0, noise: float = 0.0, seed: int = 0, sigma: float = 0.1, survey: float = 0.02
 ) -> Landmarks:
     """Twenty of them from 60 m on, with `noise` times their sigmas in survey and marks."""
     truth = spread_points(20, 60.0, far, 5)
     pixels = torch.stack([bent(truth, c, k) for c in (0, 1)], 1)
-    return Landmarks(
-        names=tuple(f"post {i}" for i in range(20)),
-        points=truth + noise * survey * normal(truth.shape, 100 + seed),
-        sigma=torch.full((20, 3), survey, dtype=torch.float64),
-        pixels=pixels + noise * sigma * normal(pixels.shape, 200 + seed),
-        pixel_sigma=sigma,
-    )
+    seeds = (100 + seed, 200 + seed)
+    return posts(truth, pixels, noise=noise * sigma, error=noise * survey, survey=survey, sigma=sigma, seeds=seeds)
 
 
 def solved(marks: Landmarks, **options: float) -> RigResult:
@@ -46,20 +41,20 @@ def solved(marks: Landmarks, **options: float) -> RigResult:
 
 
 def test_the_true_coefficient_gives_the_true_rig() -> None:
-    found = solved(posts(0.31), refraction=0.31, refraction_sigma=0.0)
+    found = solved(lifted(0.31), refraction=0.31, refraction_sigma=0.0)
     assert found.refraction == 0.31
     assert float((found.center - CENTER[:2]).abs().max()) < 1e-8
     assert float((found.rotation - ROTATION[:2]).abs().max()) < 1e-11
     # Straight lines bend the rig instead: 0.31 is a fifth of a pixel at 5 km.
-    assert float((solved(posts(0.31), refraction=0.0, refraction_sigma=0.0).center - CENTER[:2]).abs().max()) > 1e-3
+    assert float((solved(lifted(0.31), refraction=0.0, refraction_sigma=0.0).center - CENTER[:2]).abs().max()) > 1e-3
 
 
 def test_landmarks_that_tell_it_tell_it() -> None:
-    found = solved(posts(0.31, sigma=1e-3, survey=1e-3))
+    found = solved(lifted(0.31, sigma=1e-3, survey=1e-3))
     sigma = float(found.mounting_covariance()[6, 6].sqrt())
     assert sigma < 0.02
     assert abs(found.refraction - 0.31) < 0.2 * sigma + 0.18 * (sigma / 0.1) ** 2
-    near = solved(posts(0.31, far=300.0))
+    near = solved(lifted(0.31, far=300.0))
     assert abs(near.refraction - 0.13) < 1e-3
     assert float(near.mounting_covariance()[6, 6].sqrt()) == pytest.approx(0.1, rel=1e-3)
 
@@ -74,7 +69,7 @@ def test_heights_have_the_errors_that_are_stated() -> None:
     whole, apart, draws = 0.0, 0.0, 40
     for seed in range(draws):
         k = 0.13 + 0.1 * float(normal((), 900 + seed))
-        rig = placed_rig(solved(posts(k, noise=1.0, seed=1000 * seed)), ORIGIN)
+        rig = placed_rig(solved(lifted(k, noise=1.0, seed=1000 * seed)), ORIGIN)
         pixels = [bent(target, c, k) for c in (0, 1)]
         assert rig.mounting is not None
         for linked in (True, False):
@@ -100,7 +95,7 @@ def test_heights_have_the_errors_that_are_stated() -> None:
 
 
 def test_a_file_keeps_it_and_the_localizer_takes_it(tmp_path: Path) -> None:
-    rig = placed_rig(solved(posts(0.31)), ORIGIN)
+    rig = placed_rig(solved(lifted(0.31)), ORIGIN)
     again = load_rig(save_rig(rig, tmp_path / "rig.json"))
     assert rig.mounting is not None
     assert again.mounting is not None
@@ -124,9 +119,9 @@ def test_a_file_keeps_it_and_the_localizer_takes_it(tmp_path: Path) -> None:
 
 def test_light_of_another_day_is_no_drift() -> None:
     """Landmarks at 2 to 5 km rise by 0.06 to 0.16 px when k grows by 0.25: what is not known of it explains that."""
-    rig = placed_rig(solved(posts(0.13, sigma=0.01, survey=1e-3)), ORIGIN)
+    rig = placed_rig(solved(lifted(0.13, sigma=0.01, survey=1e-3)), ORIGIN)
     assert rig.mounting is not None
-    now = posts(0.38, sigma=0.01, survey=1e-3)
+    now = lifted(0.38, sigma=0.01, survey=1e-3)
     place = rig.mounting.origin
     marks = dataclasses.replace(now, points=now.points - CENTER[0])
     assert abs(place.height - (ORIGIN.height + float(CENTER[0, 2]))) < 0.1

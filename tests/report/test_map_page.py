@@ -11,12 +11,13 @@ import pytest
 import torch
 from browser import at_rest, chromium_page, needs_browser
 from drawn_scenes import PLACES
+from drawn_scenes import located as four_things
 from locate_rigs import located_pairs, pinhole_rig, tensor
 from PIL import Image, TiffImagePlugin
 from waiting import wait_for
 
 from kcal import FileError, InputError, Origin
-from kcal.locate import enu_from_cam, geodetic_to_enu
+from kcal.locate import geodetic_to_enu
 from kcal.locate.positions import Located
 from kcal.report.map_page import local_image, local_tiles, map_page, save_map
 
@@ -24,12 +25,7 @@ ORIGIN = Origin(lat=19.07, lon=72.87, height=14.0)
 
 
 def scene(origin: Origin = ORIGIN) -> tuple[Located, torch.Tensor]:
-    left, right = pinhole_rig()(PLACES)[0].unbind(-2)
-    names = ["gate", "</script><b>mast", "ship", "cloud"]
-    located = located_pairs(
-        pinhole_rig(), left, right + tensor([0.3, 0.0]), origin=origin, heading_deg=300.0, names=names
-    )
-    return located, PLACES @ enu_from_cam(300.0).T
+    return four_things(mast="</script><b>mast", origin=origin)
 
 
 def data(page: str) -> dict[str, object]:

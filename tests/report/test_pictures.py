@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 from calibrate_scenes import BOARD
-from drawn_scenes import FIGURES, boxes, calibrated, landmarks_rig, sites
+from drawn_scenes import FIGURES, bent, boxes, calibrated, landmarks_rig, sites
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver, QuiverKey
 
-from kcal import Board, CalibrationOptions, Camera, Observations, calibrate_camera
+from kcal import CalibrationOptions, Camera, Observations, calibrate_camera
 from kcal.calibrate.camera.advice import unreached_share
 from kcal.calibrate.camera.export import Misfit
-from kcal.calibrate.hybrid.measured_board import MeasuredBoard, board_text
+from kcal.calibrate.hybrid.measured_board import board_text
 from kcal.lens import camera_difference
 from kcal.locate.siting import siting_map
 from kcal.report import rig_figure
@@ -104,16 +104,8 @@ def test_a_gallery_is_in_order_after_what_stands_out() -> None:
 # The picture of a measured board.
 
 
-def bent_board(scale: float) -> MeasuredBoard:
-    amplitudes = torch.zeros(28, dtype=torch.float64)
-    amplitudes[1], amplitudes[12] = scale, scale
-    half = 1e-5 * torch.eye(28, dtype=torch.float64)
-    board = Board(columns=6, rows=9, square=0.02)
-    return MeasuredBoard(name="plate", board=board, amplitudes=amplitudes, half=half, log_evidence=0.0)
-
-
 def test_text_of_a_flat_board() -> None:
-    lines = board_text(bent_board(0.0))
+    lines = board_text(bent(0.0))
     assert lines[0].startswith("bending 0.000 ± 0.0")
     assert [line.split()[0] for line in lines] == ["bending", "stretch", "shear", "print"]
 

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from calibrate_scenes import observe
-from rig_scenes import BOARD, CENTER, ROTATION, generator, normal, spread_points, tensor
+from rig_scenes import BOARD, CENTER, ROTATION, generator, normal, posts, spread_points, tensor
 from torch import Tensor
 
 from kcal import Camera, InputError, Landmarks, Localizer, Observations, RigData, RigOptions, calibrate_rig, solve_rig
@@ -54,13 +54,8 @@ def calibrated(seed: int) -> Camera:
 def survey(seed: int) -> Landmarks:
     truth = spread_points(10, 60.0, 600.0, 5)
     pixels = torch.stack([see(truth, place) for place in (0, 1)], 1)
-    return Landmarks(
-        names=tuple(f"post {i}" for i in range(len(truth))),
-        points=truth + SURVEY * normal(truth.shape, 100 + seed),
-        sigma=torch.full(truth.shape, SURVEY, dtype=torch.float64),
-        pixels=pixels + NOISE * normal(pixels.shape, 200 + seed),
-        pixel_sigma=NOISE,
-    )
+    seeds = (100 + seed, 200 + seed)
+    return posts(truth, pixels, noise=NOISE, error=SURVEY, survey=SURVEY, sigma=NOISE, seeds=seeds)
 
 
 def rig(cameras: tuple[Camera, Camera], landmarks: Landmarks, options: RigOptions = STRAIGHT) -> RigResult:

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, generator, landmarks, normal, see, tensor
+from rig_scenes import CAMERAS, CENTER, NAMES, ROTATION, generator, landmarks, normal, posts, see, tensor
 from torch import Tensor
 
 from kcal import Camera, DegenerateError, Landmarks, Localizer, MeasuredPosition, Origin, RigData, RigOptions, solve_rig
@@ -30,13 +30,8 @@ def surveyed(points: Tensor, seed: int, *, mark: float = 0.3, survey: float = 0.
     """Points of the left camera's frame, marked and surveyed with noise."""
     points = points @ ROTATION[0] + CENTER[0]
     pixels = torch.stack([see(points, camera) for camera in (0, 1)], 1)
-    return Landmarks(
-        names=tuple(f"post {i}" for i in range(len(points))),
-        points=points + survey * normal(points.shape, 1000 + seed),
-        sigma=torch.full_like(points, survey),
-        pixels=pixels + mark * normal(pixels.shape, 2000 + seed),
-        pixel_sigma=mark,
-    )
+    seeds = (1000 + seed, 2000 + seed)
+    return posts(points, pixels, noise=mark, error=survey, survey=survey, sigma=mark, seeds=seeds)
 
 
 def solved(seen: Landmarks, options: RigOptions = HELD, sigma: float | None = None) -> RigResult:
