@@ -15,8 +15,7 @@ from kcal.lens.projection import pupil_depth
 from kcal.lens.uncertainty import image_sigma
 from kcal.report.calibration import board_figure
 from kcal.report.figures import ACCENT, frame_image, new_figure, save_picture
-from scripts.shared.real_captures import stereo_images
-from scripts.shared.wide_lens import load
+from scripts.shared.real_captures import load, stereo_images
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "explanation"
 
@@ -24,8 +23,7 @@ FOLDER = Path(__file__).resolve().parent.parent / "docs" / "explanation"
 def main() -> None:
     figure = new_figure(11.0, 4.4)
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.0, 1.2], "wspace": 0.22})
-    seen, _ = load()
-    wide = calibrate_camera(seen)
+    wide = calibrate_camera(load("wide").seen)
     rays, valid = wide.camera.unproject(wide.camera.grid(33, 25).reshape(-1, 2))
     widest = float(torch.acos(rays[valid][:, 2].clamp(-1.0, 1.0)).max())
     angle = torch.linspace(0.0, widest, 100, dtype=torch.float64)

@@ -31,15 +31,14 @@ from kcal.report.figures import ACCENT, FAINT, GRAY, INK, WARN, new_figure, save
 from kcal.sim.captures import PrintedBoard, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM, DemoScene, NamedPoints
-from scripts.check.chain_rig import localizer
+from scripts.check.chain import localizer
 from scripts.make_assets import ASSETS
 from scripts.paper.locate import SIDES
 from scripts.paper.locate import by_opencv as opencv_rig
-from scripts.shared.captures import capture_corners
+from scripts.shared.captures import as_observations, capture_corners
 from scripts.shared.long_range import landmarks_of
+from scripts.shared.page import show
 from scripts.shared.peer_lenses import calibrated
-from scripts.shared.timing import show
-from scripts.shared.traced import as_observations
 
 RANGES, BEARINGS = (1000.0, 5000.0), (-32.0, -24.0, -16.0, -8.0, 0.0, 8.0, 16.0, 24.0, 32.0)
 NOISE, VIEWS = 0.05, 20

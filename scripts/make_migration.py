@@ -11,7 +11,8 @@ from __future__ import annotations
 import re
 import subprocess
 
-from scripts.make_promises import DOORS, FOLDER
+from scripts.make_promises import FOLDER
+from scripts.make_reference import DOORS
 from scripts.shared.page import DOCS, table
 
 FIRST = "35b517ae"  # the commit of 1.0

@@ -19,10 +19,8 @@ from typing import Any
 
 import typer
 
-from scripts.make_reference import returned_by
+from scripts.make_reference import DOORS, returned_by
 
-DOORS = ("kcal", *(f"kcal.{name}" for name in
-         ["lens", "corners", "calibrate", "rig", "locate", "track", "report", "stars", "solve", "nets"]))  # fmt: skip
 SOURCES = "kcal.calibrate.rig.source"
 FOLDER = Path(__file__).parents[1] / "tests" / "promises"
 

@@ -28,9 +28,18 @@ from pathlib import Path
 from typing import Any
 
 from scripts.shared.children import ASKED, answer
-from scripts.shared.page import DOCS, laid_out, read_section, write_section
-from scripts.shared.sections import SECTIONS, Kept, Section, seeds
-from scripts.shared.timing import children_seconds, show
+from scripts.shared.page import (
+    DOCS,
+    SECTIONS,
+    Kept,
+    Section,
+    children_seconds,
+    laid_out,
+    read_section,
+    seeds,
+    show,
+    write_section,
+)
 
 ROOT = Path(__file__).parent
 # Packages whose versions change what is measured, and modules of others, which count where a section loaded them.

@@ -15,7 +15,7 @@ import pytest
 
 from scripts import measure
 from scripts.shared import page as shared_page
-from scripts.shared.sections import Section
+from scripts.shared.page import Section
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs" / "measured").glob("*.md"))

@@ -10,17 +10,18 @@ from calibrate_scenes import camera, motions, observe, pixels_of
 
 from kcal import CalibrationOptions
 from scripts.measure import make
-from scripts.paper import chain, figures, locate, reproduce, solve, train_eq12, train_net_lens
+from scripts.paper import chain, locate, reproduce, train_eq12, train_net_lens
+from scripts.paper import page as paper_page
 from scripts.paper.page import TABLE_3
 from scripts.shared import page
-from scripts.shared.sections import SECTIONS, Kept
+from scripts.shared.page import SECTIONS, Kept
 
 
 @pytest.fixture
 def written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A page that scripts may write to."""
     monkeypatch.setattr(page, "DOCS", tmp_path)
-    monkeypatch.setattr(figures, "DOCS", tmp_path)
+    monkeypatch.setattr(paper_page, "DOCS", tmp_path)
     path = tmp_path / "paper.md"
     path.write_text("# Page\n", encoding="utf-8")
     return path
@@ -86,10 +87,10 @@ def test_halves_are_blocks_of_views(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 def test_the_experiment(monkeypatch: pytest.MonkeyPatch, written: Path, tmp_path: Path) -> None:
     """Every stage once; models that are left out take the results of the first one."""
-    monkeypatch.setattr(solve, "ALL", {"14": "opencv5"})
+    monkeypatch.setattr(reproduce, "ALL", {"14": "opencv5"})
     monkeypatch.setattr(locate, "DRAWS", 1)
     monkeypatch.setattr(locate, "MARKINGS", 1)
-    real = solve.run_seed
+    real = reproduce.run_seed
 
     def run_seed(folder: Path, *arguments: object) -> dict:
         result = real(folder, *arguments)  # type: ignore[arg-type]

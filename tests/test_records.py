@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from kcal.lens.camera import Camera
-from scripts.check import aspect, captures_that_move, ordinary
+from scripts.check import captures_that_move, ordinary, verdict
 from scripts.shared.held_out import held_out
+from scripts.shared.page import Kept, seeds
 from scripts.shared.peer_lenses import SplinedCamera
-from scripts.shared.sections import Kept, seeds
 from scripts.shared.simulated import BOARD, stretched
 
 
@@ -117,7 +117,7 @@ def test_tables_count_what_was_refused_and_said() -> None:
         {"key": [1.01, k], "factor": 1.01, "aspect": 1.012, "hand": k == 0, "said": text}
         for k, text in enumerate(([], ["pixels are not square"], ["pixels are not square"]))
     ]
-    assert [*aspect.lines(said)][2:] == [
+    assert [*verdict.aspect_lines(said)][2:] == [
         "| 1.01 | by hand | 1 | 0 | 0.0 % | – |",
         "| 1.01 | on a stand | 2 | 2 | 100.0 % | 0.0020 |",
     ]

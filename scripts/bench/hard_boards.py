@@ -17,8 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcal import Camera
-from kcal.corners.board import Board
+from kcal import Board, Camera
 from kcal.corners.print_board import pattern_shapes
 from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, PoseOptions, sample_board_poses

@@ -23,18 +23,15 @@ from torch import Tensor
 import kcal.lens.inverse
 from kcal import Camera, Rig
 from kcal.calibrate.hybrid.fit import fit_hybrid
-from kcal.lens import LensModel, bake, cylinder_view, looking, pinhole_view
-from kcal.lens.camera_like import Unproject
+from kcal.lens import LensModel, Unproject, bake, cylinder_view, looking, pinhole_view
 from kcal.lens.images import StereoRectification, Undistort, undistort_maps
 from kcal.lens.inverse import InverseStart
 from kcal.lens.model import HybridForm, distort_components
 from kcal.lens.zernike import ZernikeModes
 from kcal.nets import train_inverse
-from scripts.shared import wide_lens
 from scripts.shared.distorted import distort
-from scripts.shared.page import Lines
-from scripts.shared.sections import section
-from scripts.shared.timing import median, ratio, times
+from scripts.shared.page import Lines, median, ratio, section, timed, times
+from scripts.shared.real_captures import load
 
 SIZE = (1920, 1080)
 # A barrel lens of 62 degrees across, every term of OpenCV's at work, and no fold in the image.
@@ -111,8 +108,8 @@ def hybrid_throughput(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Lin
         "direction", "points", "hybrid", "first call, ms", "opencv14", "OpenCV", "hybrid / OpenCV",
         "largest difference to the formulas, px",
     ]  # fmt: skip
-    seen, weights = wide_lens.load()
-    fitted = fit_hybrid(seen.board.points, seen.pixels(), seen.image_size, torch.from_numpy(weights)).camera
+    seen, weight = load("wide")
+    fitted = fit_hybrid(seen.board.points, seen.pixels(), seen.image_size, weight).camera
     plain = build("opencv14")
     for direction, count in itertools.product(("project", "unproject"), points):
         # A new camera, so that its first call fits the polynomials.
@@ -288,9 +285,7 @@ def lookup_tables(rounds: int = 15, cameras: tuple[str, ...] = tuple(CAMERAS)) -
         rays, _ = camera.unproject(pixels)
         few, few_rays = pixels[:POINTS], rays[:POINTS]
         for tolerance in (1e-2, 1e-3):
-            clock = time.process_time()
-            lookup = bake(camera, tolerance)
-            seconds = time.process_time() - clock
+            lookup, seconds = timed(bake, camera, tolerance)
             again, valid = lookup.unproject(pixels)
             largest = float((camera.project_rays(again)[0] - pixels).norm(dim=-1)[valid].max())
             there, seen = lookup.project(rays)
@@ -338,9 +333,7 @@ def views(rounds: int = 30) -> Lines:
         ("stereo pair", lambda: [getattr(StereoRectification(rig), side) for side in ("left", "right")]),
     ]
     for name, make in kinds:
-        start = time.process_time()
-        modules = make()
-        spent = time.process_time() - start
+        modules, spent = timed(make)
         pixels = sum(module.mask.numel() for module in modules) / 1e6
         cells = [f"{1e3 * spent / pixels:.0f}"]
         for dtype in (torch.float32, torch.uint8):

@@ -21,8 +21,7 @@ from kcal import Localizer, Origin, Rig, save_rig
 from kcal.pipeline.pairing import ObjectViews
 from kcal.rig import Mounting, RigCovariance, planned_rig
 from kcal.track import Tracker
-from scripts.shared.page import Lines
-from scripts.shared.sections import section
+from scripts.shared.page import Lines, section
 
 
 def site_rig() -> Rig:

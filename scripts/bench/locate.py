@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -23,21 +22,16 @@ import torch
 from kornia.geometry.epipolar import triangulate_points
 from torch import Tensor
 
-from kcal import save_rig
-from kcal.lens.pair_errors import RigCovariance
+from kcal import Localizer, Origin, Rig, save_rig
 from kcal.lens.pose import rotation_from_vector
 from kcal.lens.projection import project_components
-from kcal.lens.rig import Origin, Rig
 from kcal.locate.angular import triangulate_linear, triangulate_pairs
 from kcal.locate.geodesy import enu_to_geodetic
-from kcal.locate.localizer import Localizer
 from kcal.locate.tabulate import circular_error
-from kcal.rig import Mounting, mounting_covariance
+from kcal.rig import Mounting, RigCovariance, mounting_covariance
 from scripts.shared.children import answer
 from scripts.shared.long_range import ORIGIN, RANGES, rig
-from scripts.shared.page import Lines, table
-from scripts.shared.sections import section
-from scripts.shared.timing import median, ratio, times
+from scripts.shared.page import Lines, median, ratio, section, times
 
 COUNTS = (100, 10_000, 1_000_000)
 
@@ -128,13 +122,17 @@ def known_to() -> RigCovariance:
     return RigCovariance.of(rig(), left=torch.diag(camera**2), right=torch.diag(camera**2), pose=torch.diag(pose**2))
 
 
+def localizers() -> tuple[Localizer, Localizer]:
+    """Of that rig without errors of its own, and with those of a good calibration."""
+    placed = [rig().placed(origin=ORIGIN, heading_deg=35.0) for _ in range(2)]
+    placed[1].covariance = known_to()
+    return Localizer(placed[0], pixel_sigma=0.1), Localizer(placed[1], pixel_sigma=0.1)
+
+
 @section("locate.md", "localizer", rounds=1, points=COUNTS[:1])
 @torch.no_grad()
 def localizer(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Lines:
-    plain = Localizer(rig().placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
-    wide = rig()
-    wide.covariance = known_to()
-    known = Localizer(wide.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
+    plain, known = localizers()
     yield ["points", "marks' noise given once", "a 4x4 covariance a point", "with the calibration's covariance"]
     for count in points:
         left, right = rig()(some_points(count))[0].unbind(-2)
@@ -151,11 +149,8 @@ def localizer(rounds: int = 15, points: tuple[int, ...] = COUNTS) -> Lines:
 @torch.no_grad()
 def coverage(draws: int = 40_000) -> Lines:
     """Simulated marks, and rigs drawn from their own covariance, at seven ranges."""
-    there, known = rig(), known_to()
-    plain = Localizer(there.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
-    there.covariance = known
-    wide = Localizer(there.placed(origin=ORIGIN, heading_deg=35.0), pixel_sigma=0.1)
-    factor, generator = known.half.T, torch.Generator().manual_seed(7)
+    there, (plain, wide) = rig(), localizers()
+    factor, generator = known_to().half.T, torch.Generator().manual_seed(7)
     yield [
         "range, m", "marks only: interval", "CEP50", "CEP95", "RMS of range / bound", "with calibration: interval",
         "interval of marks alone, same rigs",
@@ -239,7 +234,7 @@ for points in (small, large):
         main()
     except SystemExit as end:
         assert not end.code, end.code
-from scripts.shared.memory import peak_megabytes
+from scripts.shared.page import peak_megabytes
 print(json.dumps({"seconds": time.process_time() - start, "megabytes": peak_megabytes()}))
 """
 
@@ -257,7 +252,7 @@ def write_table(path: Path, count: int) -> Path:
     return path
 
 
-def _rows(folder: Path, suffixes: tuple[str, ...], counts: tuple[int, ...], repeat: int) -> Iterator[list[str]]:
+def _rows(folder: Path, suffixes: tuple[str, ...], counts: tuple[int, ...], repeat: int) -> Lines:
     """After a table of one row."""
     exact, known = rig(), rig()
     exact.mounting = Mounting(origin=ORIGIN, heading_deg=35.0)
@@ -281,8 +276,8 @@ def _rows(folder: Path, suffixes: tuple[str, ...], counts: tuple[int, ...], repe
 
 
 @section("locate.md", "tables", rows=(1000,), formats=("csv",), repeat=1)
-def tables(rows: tuple[int, ...] = ROWS, formats: tuple[str, ...] = SUFFIXES, repeat: int = 3) -> Iterator[str]:
+def tables(rows: tuple[int, ...] = ROWS, formats: tuple[str, ...] = SUFFIXES, repeat: int = 3) -> Lines:
     """Each format with each rig."""
+    yield ["file", "rig", "rows", "rows a second of processor time", "peak MB"]
     with tempfile.TemporaryDirectory() as name:
-        made = _rows(Path(name), formats, rows, repeat)
-        yield from table(["file", "rig", "rows", "rows a second of processor time", "peak MB"], made)
+        yield from _rows(Path(name), formats, rows, repeat)

@@ -8,13 +8,10 @@ with --rig they stay as they are.
 
 from __future__ import annotations
 
-import functools
 import os
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -31,8 +28,8 @@ from kcal.mark.items import SIDES, Mark, Put
 from kcal.mark.marking_service import Desk, solve_live
 from kcal.mark.session import Session
 from kcal.rig import Survey
-from scripts.shared.page import table
-from scripts.shared.sections import section
+from scripts.shared.children import marking_server
+from scripts.shared.page import section, table, timed
 from scripts.shared.simulated import simulated
 
 # Of captures by a machine-vision lens.
@@ -81,18 +78,10 @@ def make_site(folder: Path, count: int, views: int) -> Marks:
 
 def until_address(folder: Path, *arguments: str) -> float:
     """CPU seconds of `kcal mark` until it prints the page's address."""
-    command = [sys.executable, "-m", "kcal", "mark", "left.png", "right.png", *arguments, "-o", "new.csv"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")])}
-    server = subprocess.Popen(
-        [*command, "--port", "0", "--no-browser"], stdout=subprocess.PIPE, text=True, cwd=folder, env=environment
-    )
-    try:
-        assert server.stdout is not None
-        assert "http://" in server.stdout.readline()
-        return sum(psutil.Process(server.pid).cpu_times()[:2])
-    finally:
-        server.kill()
-        server.wait()
+    with marking_server(folder, *arguments, "-o", "new.csv", env=environment) as (address, process):
+        assert "http://" in address
+        return sum(psutil.Process(process).cpu_times()[:2])
 
 
 @contextmanager
@@ -105,13 +94,6 @@ def opened(folder: Path, by: str) -> Iterator[Desk]:
     desk = Desk(pictures, session, cameras if known is None else None, known)
     yield desk
     desk.close()
-
-
-def timed(work: Callable[[], object]) -> float:
-    """CPU seconds of this process."""
-    start = time.process_time()
-    work()
-    return time.process_time() - start
 
 
 def report(desk: Desk, marks: Marks, moves: int) -> float:
@@ -137,7 +119,7 @@ def report(desk: Desk, marks: Marks, moves: int) -> float:
         put(row, 1, 0.0)
     while desk.state()["pending"]:
         time.sleep(0.02)
-    return float(np.median([timed(functools.partial(moved, row)) for row in range(moves)]))
+    return float(np.median([timed(moved, row)[1] for row in range(moves)]))
 
 
 @section("marking.md", "time", landmarks=6, moves=1, views=6)

@@ -18,15 +18,13 @@ import cv2
 import numpy as np
 import torch
 
-from kcal import Camera, Observations, RigOptions, calibrate_rig
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal import CalibrationOptions, Camera, Observations, RigOptions, calibrate_camera, calibrate_rig
 from kcal.report.judge_rig import triangulated_sides
 from kcal.rig import pair_by_name
-from scripts.shared.page import Lines
+from scripts.shared.captures import as_observations
+from scripts.shared.page import Lines, section, times
 from scripts.shared.peer_lenses import calibrated
 from scripts.shared.real_captures import stereo_images
-from scripts.shared.sections import section
-from scripts.shared.timing import times
 
 CRITERIA = (3, 300, 1e-12)
 MODELS = ("opencv5", "opencv8", "opencv12", "opencv14")
@@ -35,10 +33,8 @@ MODELS = ("opencv5", "opencv8", "opencv12", "opencv14")
 @functools.cache
 def _observe(side: str) -> Observations:
     found = stereo_images(side)
-    views = []
-    for view in found.views:
-        rounded = tuple(p if p is None else (float(np.float32(p[0])), float(np.float32(p[1]))) for p in view.pixels)
-        views.append(view.model_copy(update={"pixels": rounded}))
+    rounded = as_observations(found.pixels().float().double(), found.image_size, found.board).views
+    views = (view.model_copy(update={"pixels": own.pixels}) for view, own in zip(found.views, rounded, strict=True))
     return found.model_copy(update={"views": tuple(views)})
 
 

@@ -23,7 +23,7 @@ _LENS = "LENSMODEL_OPENCV8"
 def main() -> None:
     sys.path.append(str(Path(__file__).parents[2]))
     from scripts.bench.peer_mrcal import problem, seeded
-    from scripts.shared.memory import peak_megabytes
+    from scripts.shared.page import peak_megabytes
 
     with np.load(sys.argv[1]) as data:
         corners, size, (columns, rows) = data["corners"], data["image_size"].astype(np.int32), data["board_size"]

@@ -24,9 +24,7 @@ from typing import Any
 import numpy as np
 
 from scripts.shared.children import answer, interpreter
-from scripts.shared.memory import peak_megabytes
-from scripts.shared.page import table
-from scripts.shared.sections import section
+from scripts.shared.page import peak_megabytes, section, table, timed
 from scripts.shared.views import (
     COLUMNS,
     MODELS,
@@ -51,9 +49,8 @@ def with_kcal(data: dict[str, np.ndarray], coefficients: int, weak: float | None
     from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
 
     seen = observed(data["pixels"].tolist())
-    start = time.process_time()
-    result = calibrate_camera(seen, CalibrationOptions(model=MODELS[coefficients], weak_prior=weak))
-    seconds = time.process_time() - start
+    options = CalibrationOptions(model=MODELS[coefficients], weak_prior=weak)
+    result, seconds = timed(calibrate_camera, seen, options)
     vector = result.camera.params.detach().numpy()
     poses = result.cam_from_board_rotation.numpy(), result.cam_from_board_translation.numpy()
     return vector[:4], vector[5:], *poses, seconds
@@ -67,11 +64,10 @@ def with_opencv(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ..
     flags = {5: 0, 8: rich, 14: rich | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL}[coefficients]
     boards = [data["board"].astype(np.float32)] * len(data["pixels"])
     corners = [view.astype(np.float32)[:, None] for view in data["pixels"]]
-    start = time.process_time()
-    _, matrix, lens, turns, shifts = cv2.calibrateCamera(
-        boards, corners, SIZE, None, None, flags=flags, criteria=(3, 100, 1e-10)
+    solve: Any = cv2.calibrateCamera
+    (_, matrix, lens, turns, shifts), seconds = timed(
+        solve, boards, corners, SIZE, None, None, flags=flags, criteria=(3, 100, 1e-10)
     )
-    seconds = time.process_time() - start
     rotation = np.array([cv2.Rodrigues(turn)[0] for turn in turns])
     pinhole = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
     return pinhole, lens.ravel()[:coefficients], rotation, np.array(shifts).reshape(-1, 3), seconds
@@ -105,17 +101,11 @@ def with_mrcal(data: dict[str, np.ndarray], coefficients: int) -> tuple[Any, ...
     seen = np.ones((count, ROWS, COLUMNS, 3))
     seen[..., :2] = data["pixels"].reshape(count, ROWS, COLUMNS, 2)
     index = np.stack([np.arange(count), np.zeros(count), -np.ones(count)], 1).astype(np.int32)
-    start = time.process_time()
-    mrcal.optimize(
-        **problem(intrinsics, None, frames, seen, index),
-        lensmodel=f"LENSMODEL_OPENCV{coefficients}",
-        imagersizes=np.array([SIZE], np.int32),
-        calibration_object_spacing=SQUARE,
-        do_apply_outlier_rejection=False,
-        do_optimize_calobject_warp=False,
-        do_apply_regularization=False,
-    )
-    seconds = time.process_time() - start
+    _, seconds = timed(
+        mrcal.optimize, **problem(intrinsics, None, frames, seen, index), lensmodel=f"LENSMODEL_OPENCV{coefficients}",
+        imagersizes=np.array([SIZE], np.int32), calibration_object_spacing=SQUARE, do_apply_outlier_rejection=False,
+        do_optimize_calobject_warp=False, do_apply_regularization=False,
+    )  # fmt: skip
     rotation = np.array([cv2.Rodrigues(frame[:3])[0] for frame in frames])
     return intrinsics[0, :4], intrinsics[0, 4:], rotation, frames[:, 3:], seconds
 

@@ -8,7 +8,6 @@ of noise; lenses have five coefficients, kcal fits its default.
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 import tempfile
 import time
@@ -20,21 +19,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Board, Camera, Localizer, RigData, calibrate_camera, save_rig, solve_rig
+from kcal import Board, Camera, Localizer, Origin, Rig, RigData, calibrate_camera, save_rig, solve_rig
 from kcal.calibrate.rig.pairs import boards_of_several
 from kcal.lens import rotation_from_vector
-from kcal.lens.pair_errors import RigCovariance
-from kcal.lens.rig import Mounting, Origin, Rig
 from kcal.locate import terrain
 from kcal.locate.siting import Site, area_of, rank_sites, siting_map
-from kcal.rig import planned_rig
-from scripts.shared.children import answer, interpreter
-from scripts.shared.memory import peak_megabytes
-from scripts.shared.page import DOCS, Lines, table
-from scripts.shared.sections import section
+from kcal.rig import Mounting, RigCovariance, planned_rig
+from scripts.shared.captures import as_observations
+from scripts.shared.children import answer, interpreter, timed_process
+from scripts.shared.page import DOCS, Lines, peak_megabytes, section, show, table, timed, times
 from scripts.shared.station_scenes import drawn_errors, hills, marks, ring, targets
-from scripts.shared.timing import children_seconds, show, times
-from scripts.shared.traced import as_observations
 
 _CORNER, _CELL = (44.75, 5.72), 0.0014
 _TOWERS = (("mill", 44.9, 5.85), ("church", 45.1, 5.9), ("mast", 45.15, 6.15), ("hill", 44.87, 6.1), ("dam", 45.0, 6.0))
@@ -143,8 +137,7 @@ def two(pairs: int = 200_000) -> Lines:
 def _timed(localize: torch.nn.Module, *marked: Tensor) -> tuple[Any, float]:
     """The result, and CPU seconds of the second call."""
     localize(*marked)
-    start = time.process_time()
-    return localize(*marked), time.process_time() - start
+    return timed(localize, *marked)
 
 
 @section("stations.md", "table", sizes=(300,))
@@ -165,13 +158,11 @@ def long_tables(sizes: tuple[int, ...] = (100_000, 1_000_000)) -> Lines:
                         for name, (u, v) in zip(rig.names, thing, strict=True):
                             file.write(f"t{i},{name},{u:.2f},{v:.2f}\n")
             code = (
-                "import sys; from kcal.cli.main import app; from scripts.shared.memory import peak_megabytes\n"
+                "import sys; from kcal.cli.main import app; from scripts.shared.page import peak_megabytes\n"
                 "try: app(sys.argv[1:])\nexcept SystemExit: pass\nprint('peak', peak_megabytes(), file=sys.stderr)"
             )
             words = ["locate", "rig.json", "marks.csv", "-o", "out.csv", "--json"]
-            before = children_seconds()
-            done = subprocess.run([sys.executable, "-c", code, *words], cwd=folder, capture_output=True, text=True)
-            spent = children_seconds() - before
+            done, spent = timed_process(sys.executable, "-c", code, *words, cwd=folder)
             peak = float(done.stderr.split("peak ")[-1])
             with Path(folder, "out.csv").open() as file:
                 lines = sum(1 for _ in file) - 1

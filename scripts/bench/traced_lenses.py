@@ -22,25 +22,27 @@ import functools
 import itertools
 import math
 import statistics
-import time
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from kcal import KcalError, Observations
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
-from kcal.lens.camera import Camera
+from kcal import CalibrationOptions, Camera, KcalError, Observations, calibrate_camera
 from kcal.sim.captures import LensLike, board_points, drawn_lens
-from scripts.shared.captures import PAPER_BOARD, capture_corners
-from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import Line, Lines
-from scripts.shared.prescriptions import PRESCRIPTIONS
-from scripts.shared.sections import NOT_KEPT, Kept, Record, section
+from scripts.shared.captures import (
+    BOARD,
+    PAPER_BOARD,
+    PRESCRIPTIONS,
+    as_observations,
+    capture,
+    capture_corners,
+    captures,
+    error_at_infinity,
+    printed,
+)
+from scripts.shared.page import NOT_KEPT, Kept, Line, Lines, Record, section, share, timed
 from scripts.shared.simulated import LENSES, figures, quick
-from scripts.shared.timing import share
-from scripts.shared.traced import BOARD, as_observations, capture, captures, printed
 from scripts.shared.views import TRUTH
 
 SIGMAS = (0.02, 0.05, 0.1, 0.3)
@@ -88,10 +90,8 @@ def fits_of(
 
 def measured(lens: LensLike, seen: Observations, options: CalibrationOptions) -> Record:
     """One calibration against the truth."""
-    start = time.process_time()
     try:
-        result = calibrate_camera(seen, options)
-        spent = time.process_time() - start
+        result, spent = timed(calibrate_camera, seen, options)
         error = error_at_infinity(result.camera, lens)
     except KcalError as refusal:
         return {"rms": math.inf, "failed": str(refusal)}

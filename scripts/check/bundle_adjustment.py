@@ -19,11 +19,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from kcal import Camera, calibrate_camera
-from kcal.calibrate.camera.calibrate import CalibrationOptions
+from kcal import CalibrationOptions, Camera, calibrate_camera
 from kcal.lens import export_cameras
-from scripts.shared.page import Lines
-from scripts.shared.sections import section
+from scripts.check.foreign_lenses import pycolmap_camera
+from scripts.shared.page import Lines, section
 from scripts.shared.simulated import simulated
 from scripts.shared.views import observed, simulate
 
@@ -105,11 +104,7 @@ def by_colmap(scene: Scene, camera: Camera, way: str, folder: Path) -> Adjusted:
 
     done = export_cameras(camera, folder / "cameras.txt", format="colmap")
     reconstruction = pycolmap.Reconstruction()
-    _, model, width, height, *values = done.paths[0].read_text().splitlines()[-1].split()
-    lens = pycolmap.Camera(
-        model=model, width=int(width), height=int(height), params=list(map(float, values)), camera_id=1
-    )
-    reconstruction.add_camera_with_trivial_rig(lens)
+    reconstruction.add_camera_with_trivial_rig(pycolmap_camera(done.paths[0], camera_id=1))
     for number, (rotation, translation) in enumerate(zip(scene.rotations, scene.translations, strict=True), 1):
         marks = np.nan_to_num(scene.pixels[number - 1] + 0.5, nan=-1.0)
         image = pycolmap.Image(

@@ -1,7 +1,7 @@
 """Captures by hand, with a stabilizer, of boards that bend, and pairs that are not simultaneous: do error bars hold?
 
 Truth: three traced lenses in turn, decentered, whose entrance pupils move; printed boards (7 x 6 corners, 5 cm), noise
-of 0.08 px. By hand (`scripts.shared.moving_captures`): the camera or the board is held, in turn; a rolling shutter with
+of 0.08 px. By hand (`scripts.shared.simulated`): the camera or the board is held, in turn; a rolling shutter with
 a readout of 10 to 30 ms; rates of 0.1 to 1 rad/s and 0.05 to 0.3 m/s (standard deviation along each axis, drawn for
 each capture), half of their variance tremor of 2 to 10 Hz; exposures of 5 to 20 ms, pictures with more than 12 px of
 blur taken again; noise grows along the blur, as the views' covariances say. Optical stabilizer: the image of each view
@@ -15,16 +15,31 @@ stabilizer or bend. *Apart*: the board moves on, at rates as by hand, until the 
 error of the relative pose (six numbers) in units of its covariance, squared and divided by six, which is one on the
 average, and the errors themselves, of exact cameras; and whether the range of a point 30 m away, marked exactly
 in the middle of one frame of each, lies in its 95 % interval: the relative yaw decides it.
+
+Guided photography of a board against views at random: how many views give the same camera.
+
+Each seed has a lens with five coefficients of its own, 1280 x 720, and a board of 9 x 6 corners 25 mm apart. Frames are
+rendered, with noise and a little blur, and corners are detected in them. *Random*: 20 views drawn by
+`kcal.sim.captures.sample_board_poses`: over the whole image, near and far, tilted and rolled. *Guided*: the first four
+views and each next one as `kcal capture` asks for them, held by a person: off by 5 % of the distance across and by 10 %
+along, by 8 degrees of tilt and 10 degrees of roll. A view that is not seen whole is held again.
+
+Guided capture goes on until its σ is that of the 20 random views (points at infinity, RMS over the image; both as kcal
+predicts it), or to 20 views. True errors are those of points at infinity after the best-fit rotation. Seeds below 100
+are for tuning.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 import statistics
+import tempfile
 import time
-from collections.abc import Iterator
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,21 +51,22 @@ from kcal import (
     Localizer,
     Observations,
     RigOptions,
+    View,
     calibrate_camera,
     calibrate_rig,
 )
+from kcal.calibrate.camera.advice import NextView, far_sigma
+from kcal.capture.session import CaptureOptions, CaptureSession
+from kcal.corners.detect import detect_board, view_of
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.lens.pose import Pose
 from kcal.sim.captures import BoardSize, sample_board_poses
-from scripts.shared.moving_captures import Hands, MovingCapture, draw_motion, moving_capture
-from scripts.shared.page import Lines, merged
-from scripts.shared.sections import NOT_KEPT, Kept, Record, section
-from scripts.shared.simulated import against_truth, bends, simulated
-from scripts.shared.timing import rms, share
-from scripts.shared.traced import as_observations
+from kcal.sim.scene import RenderOptions, render_board
+from scripts.shared.captures import as_observations
+from scripts.shared.page import NOT_KEPT, Kept, Lines, Record, merged, rms, section, share, timed
+from scripts.shared.simulated import Hands, MovingCapture, against_truth, bends, draw_motion, moving_capture, simulated
 
 SIGMA, FRAMES = 0.08, 6
-TERMS = ("motion", "bending")
 
 
 class Kind(NamedTuple):
@@ -117,9 +133,7 @@ def captured(kind: str, views: int, seed: int, fit: str) -> Record:
     what = KINDS[kind]
     by_view = shifts(what, views + FRAMES, seed) if what.shift else None
     case = simulated(seed, views, SIGMA, what.by_hand, bent=what.bent, share=what.share, shifts=by_view)
-    start = time.process_time()
-    found = against_truth(case, FITS[fit], () if by_view is None else by_view[views:])
-    spent = time.process_time() - start
+    found, spent = timed(against_truth, case, FITS[fit], () if by_view is None else by_view[views:])
     moved = {name: getattr(case.truth, name) for name in ("readout", "exposure", "turning", "speed")}
     return found | moved | {"cpu_s": spent, "blur": float(case.truth.blur.norm(dim=-1).square().nanmean().sqrt())}
 
@@ -183,7 +197,7 @@ def observed(pixels: Tensor, side: MovingCapture, inside: Tensor, kept: list[int
     return as_observations(pixels, CAMERA.size, RIG_BOARD, covariance=side.covariance[kept], names=names)
 
 
-def lines(name: str, records: list[Record], *terms: str) -> Iterator[str]:
+def lines(name: str, records: list[Record], *terms: str) -> Lines:
     """One row for each number of views, kind and fit, and how often these terms were found; other rows stay."""
     cells: dict[tuple[int, str, str], list[Record]] = {}
     for record in records:
@@ -211,7 +225,7 @@ def lines(name: str, records: list[Record], *terms: str) -> Iterator[str]:
     return merged("ordinary.md", name, head, rows, keys=3)
 
 
-def moving_lines(records: list[Record]) -> Iterator[str]:
+def moving_lines(records: list[Record]) -> Lines:
     """One row for each kind: what was named, and what error bars contain; what has no record stays."""
     rows = []
     for kind in MOVING:
@@ -266,22 +280,18 @@ def rigs_of(kept: Kept, seeds: range, kinds: tuple[str, ...], fits: tuple[str, .
     return [one for one in kept.records(keys, rig) if len(one["key"]) == 3 and one["key"][0] in kinds]
 
 
-@section("ordinary.md", "handheld", seeds=range(2))
-def handheld(
-    kept: Kept = NOT_KEPT, seeds: range = range(100), views: tuple[int, ...] = (8,),
-    fits: tuple[str, ...] = ("default",),
-) -> Lines:  # fmt: skip
-    """`still`: without the terms for motion."""
-    return lines("handheld", captures_of(kept, seeds, views, ("hand", "stand"), fits))
+def _registered(name: str, little: int, kinds: tuple[str, ...], *terms: str) -> None:
+    @section("ordinary.md", name, seeds=range(little))
+    def captures(
+        kept: Kept = NOT_KEPT, seeds: range = range(100), views: tuple[int, ...] = (8,),
+        fits: tuple[str, ...] = ("default",),
+    ) -> Lines:  # fmt: skip
+        """`still`: without the terms for motion; `stiff`: without the term for bending."""
+        return lines(name, captures_of(kept, seeds, views, kinds, fits), *terms)
 
 
-@section("ordinary.md", "bent", seeds=range(1))
-def bent(
-    kept: Kept = NOT_KEPT, seeds: range = range(100), views: tuple[int, ...] = (8,),
-    fits: tuple[str, ...] = ("default",),
-) -> Lines:  # fmt: skip
-    """`stiff`: without the term for bending."""
-    return lines("bent", captures_of(kept, seeds, views, ("bent", "few bent", "bent, hand"), fits), *TERMS)
+_registered("handheld", 2, ("hand", "stand"))
+_registered("bent", 1, ("bent", "few bent", "bent, hand"), "motion", "bending")
 
 
 @section("ordinary.md", "moving", seeds=range(1), rigs=range(1), kinds=("stand", "0.01 s apart, hand"))
@@ -296,3 +306,114 @@ def moving(
 @section("ordinary.md", "rigs", seeds=range(1))
 def rigs(kept: Kept = NOT_KEPT, seeds: range = range(100), fits: tuple[str, ...] = ("default", "still")) -> Lines:
     return rig_lines(rigs_of(kept, seeds, ("hand", "stand"), fits))
+
+
+BOARD = Board(columns=9, rows=6, square=0.025)
+PRINT = BoardSize(BOARD.columns, BOARD.rows, BOARD.square)
+SIZE, RANDOM = (1280, 720), 20
+ACROSS, ALONG, TILT, ROLL = 0.05, 0.10, math.radians(8.0), math.radians(10.0)
+
+
+def lens(seed: int) -> Camera:
+    """A webcam of no particular make."""
+    u = torch.randn(7, generator=torch.Generator().manual_seed(9000 + seed)).tolist()
+    return Camera.build(
+        focal=(950 + 60 * u[0],) * 2,
+        center=(639.5 + 10 * u[1], 359.5 + 10 * u[2]),
+        size=SIZE,
+        coefficients=[-0.15 + 0.05 * u[3], 0.05 + 0.02 * u[4], 4e-4 * u[5], 4e-4 * u[6], 0.0],
+        model="opencv5",
+    )
+
+
+def held(wanted: NextView, generator: torch.Generator) -> Pose:
+    """The view as a person holds the board."""
+    u = torch.randn(6, generator=generator, dtype=torch.float64)
+    turn = rotation_from_vector(torch.tensor([TILT, TILT, ROLL], dtype=torch.float64) * u[:3])
+    middle = 0.5 * (BOARD.points.amin(0) + BOARD.points.amax(0))
+    center = wanted.rotation @ middle + wanted.translation
+    distance = float(center.norm())
+    center = center * (1.0 + ALONG * float(u[3])) + ACROSS * distance * torch.cat([u[4:], u.new_zeros(1)])
+    rotation = turn @ wanted.rotation
+    return Pose(rotation, center - rotation @ middle)
+
+
+def true_error(found: Camera, truth: Camera) -> float:
+    """RMS error of points at infinity over the image along an axis, after the best-fit rotation, pixels."""
+    pixels = truth.grid(33, 19).reshape(-1, 2)
+    there, here = truth.unproject(pixels)[0], found.unproject(pixels)[0]
+    u, _, vh = torch.linalg.svd(there.T @ here)
+    return float(((found.project(there @ (u @ vh))[0] - pixels).square().sum(-1).mean() / 2).sqrt())
+
+
+def at_random(truth: Camera, seed: int) -> tuple[float, float]:
+    """σ and true error of 20 random views."""
+    generator = torch.Generator().manual_seed(100 + seed)
+    views: list[View] = []
+    for i, pose in enumerate(sample_board_poses(truth, PRINT, RANDOM, generator)):
+        found = detect_board(frame(truth, pose, generator), BOARD)
+        if found.pixels is not None:
+            views.append(view_of(found, str(i)))
+    camera = calibrate_camera(Observations(board=BOARD, image_size=SIZE, views=tuple(views))).camera
+    return far_sigma(camera), true_error(camera, truth)
+
+
+def frame(truth: Camera, pose: Pose, generator: torch.Generator) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """A rendered frame."""
+    return np.asarray(render_board(truth, pose, PRINT, RenderOptions(), generator).numpy(), np.uint8)
+
+
+def guided(truth: Camera, goal: float, seed: int) -> list[dict[str, float]]:
+    """σ and true error after each calibration, until the goal."""
+    generator = torch.Generator().manual_seed(200 + seed)
+    out: list[dict[str, float]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        session = CaptureSession(Path(folder) / "x.obs.json", BOARD, CaptureOptions(until=goal, most=RANDOM))
+        # The first suggestion needs a frame, to know the image's size.
+        session.offer(np.full((SIZE[1], SIZE[0]), 90, np.uint8), "dark", moving=False)
+        attempt = 0
+        while not session.finished:
+            session.think()
+            if session.result is not None and (not out or out[-1]["views"] < session.views):
+                error = true_error(session.result.camera, truth)
+                out.append({"views": session.views, "sigma": session.sigma, "error": error})
+                continue
+            if session.suggestion is None or attempt > 3 * RANDOM:
+                break
+            attempt += 1
+            pose = held(session.suggestion, generator)
+            if seen_whole(truth, pose):
+                session.offer(frame(truth, pose, generator), f"{attempt}.png", moving=False)
+    return out
+
+
+def seen_whole(truth: Camera, pose: Pose) -> bool:
+    """All corners are inside the image, with a margin for the outer squares."""
+    pixels, valid = truth.project(BOARD.points @ pose.rotation.T + pose.translation)
+    inside: Tensor = (pixels > 25) & (pixels < torch.tensor(SIZE) - 26)
+    return bool((inside.all(-1) & valid).all())
+
+
+def both(seed: int) -> Record:
+    """σ and true error at random and guided."""
+    truth, start = lens(seed), time.process_time()
+    random = at_random(truth, seed)
+    return {"random": random, "guided": guided(truth, random[0], seed), "cpu_s": time.process_time() - start}
+
+
+@section("ordinary.md", "capture", seeds=range(300, 301))
+def guidance(kept: Kept = NOT_KEPT, seeds: range = range(300, 308)) -> Lines:
+    """One row for each seed, and the means."""
+    records = kept.records([(seed,) for seed in seeds], both)
+    yield ["seed", "σ of 20 random views, px", "true error, px", "guided views to this σ", "true error then, px"]
+    views, ratios = [], []
+    for record in sorted(records, key=lambda r: r["key"]):
+        last, (sigma, error) = record["guided"][-1], record["random"]
+        reached = last["sigma"] <= sigma
+        views.append(last["views"])
+        ratios.append(last["error"] / error)
+        count = f"{last['views']:.0f}" if reached else f"not in {last['views']:.0f} ({last['sigma']:.3f} px)"
+        yield [record["key"][0], f"{sigma:.4f}", f"{error:.4f}", count, f"{last['error']:.4f}"]
+    ratio = math.exp(sum(map(math.log, ratios)) / len(ratios))
+    median = sorted(views)[len(views) // 2]
+    yield ["all", "", "", f"median {median:.0f}", f"{ratio:.2f} of random (geometric mean)"]

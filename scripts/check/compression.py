@@ -20,9 +20,8 @@ from torch import Tensor
 from kcal import Camera, Rig
 from kcal.pipeline.video_source import Videos
 from kcal.track import AssociationOptions
-from scripts.shared.object_scene import Floats, exposed, paint_plate, plate, true_box
-from scripts.shared.page import Lines
-from scripts.shared.sections import section
+from scripts.shared.marking_scene import Floats, exposed, paint_plate, plate, true_box
+from scripts.shared.page import Lines, section
 
 SIZE, FOCAL, FRAMES, RATE = (320, 240), 400.0, 100, 25
 # Shares of the full pace, at which plates move by some 0.4 px a frame.

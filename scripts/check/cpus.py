@@ -32,8 +32,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcal import DegenerateError, InputError, Localizer, Observations, load_camera
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal import CalibrationOptions, DegenerateError, InputError, Localizer, Observations, calibrate_camera, load_camera
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.solve import RigOptions, calibrate_rig, solve_rig
 from kcal.files import make_folder
@@ -43,10 +42,8 @@ from kcal.rig import RigCovariance, pair_by_name
 from kcal.solve import SolverStatus
 from scripts.check import rig as site
 from scripts.shared.children import ALONE
-from scripts.shared.page import DOCS, Lines, table
+from scripts.shared.page import DOCS, Lines, section, show, table
 from scripts.shared.real_captures import stereo_images
-from scripts.shared.sections import section
-from scripts.shared.timing import show
 from scripts.shared.views import observed, simulate
 
 MODELS = (None, "opencv5", "opencv14")

@@ -8,7 +8,6 @@ It ends with an error if a field of the result differs by more than 1e-9 of one 
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,8 +21,7 @@ from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 from kcal.locate.localizer import Localization, Localizer
 from kcal.rig import RigCovariance
-from scripts.shared.page import Lines
-from scripts.shared.sections import section
+from scripts.shared.page import Lines, section, timed
 
 LENSES = ("pinhole", "opencv5", "opencv14", "ext24", "fisheye4", "hybrid")
 WAYS = ("trace", "inductor", "export", "onnx")
@@ -95,9 +93,8 @@ def checked(lens: str, ways: Sequence[str]) -> list[tuple[float, float]]:
     found = []
     for way in ways:
         torch.compiler.reset()
-        start = time.process_time()
-        apart = difference(result(way, module, few, many), wanted, module.geodetic_of_origin)
-        found.append((apart, time.process_time() - start))
+        values, seconds = timed(result, way, module, few, many)
+        found.append((difference(values, wanted, module.geodetic_of_origin), seconds))
     return found
 
 

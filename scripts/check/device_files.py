@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,9 @@ import torch
 from PIL import Image
 
 from kcal.lens import import_cameras
-from scripts.check.exchange import opencv_formula, random_points
-from scripts.shared.page import table
-from scripts.shared.sections import section
+from scripts.check.exchange import random_points
+from scripts.check.foreign_lenses import opencv_formula
+from scripts.shared.page import in_folder, section, table
 
 SIZE = (1280, 720)
 K, D = np.array([[900.5, 0, 640.3], [0, 901.3, 359.2], [0, 0, 1]]), [-0.055, 0.066, 7e-4, -9e-4, -0.021]
@@ -140,5 +139,4 @@ def device_rows(folder: Path) -> Iterator[list[str]]:
 
 @section("other-programs.md", "devices")
 def devices() -> Iterator[str]:
-    with tempfile.TemporaryDirectory() as name:
-        return table(["program", "direction", "lens", "pose", "largest error, px"], [*device_rows(Path(name))])
+    return table(["program", "direction", "lens", "pose", "largest error, px"], in_folder(device_rows))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 import subprocess
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,21 +25,14 @@ from kcal.io.formats import FORMATS
 from kcal.lens import CameraCalibration, LensModel, camera_difference, export_cameras, import_cameras
 from kcal.lens.model import HybridForm, radius_over_angle
 from kcal.lens.zernike import ZernikeModes
-from scripts.check.foreign_lenses import by_formula, growth, tangential
+from scripts.check.foreign_lenses import by_formula, growth, opencv_formula, pycolmap_camera, tangential
 from scripts.shared.children import interpreter
-from scripts.shared.page import Lines, merged, table
-from scripts.shared.sections import section
+from scripts.shared.page import Lines, in_folder, merged, section, table
 
 POINTS = 10_000
-LENSES = {
-    "pinhole": [],
-    "opencv4": [-0.2, 0.05, 1e-3, -2e-3],
-    "opencv5": [-0.2, 0.05, 1e-3, -2e-3, 0.01],
-    "opencv8": [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, 0.02, 0.003],
-    "opencv12": [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, 0.02, 0.003, 1e-3, -1e-3, 2e-3, 1e-3],
-    "opencv14": [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, 0.02, 0.003, 1e-3, -1e-3, 2e-3, 1e-3, 0.01, 0.02],
-    "fisheye4": [0.05, -0.01, 0.003, -0.001],
-}
+FOURTEEN = [-0.2, 0.05, 1e-3, -2e-3, 0.01, 0.1, 0.02, 0.003, 1e-3, -1e-3, 2e-3, 1e-3, 0.01, 0.02]
+LENSES = {"pinhole": [], "fisheye4": [0.05, -0.01, 0.003, -0.001]}
+LENSES |= {f"opencv{count}": FOURTEEN[:count] for count in (4, 5, 8, 12, 14)}
 FISHEYE, BROWN = ("k1", "k2", "k3", "k4"), ("k1", "k2", "p1", "p2", "k3")
 Project = Callable[[Path, np.ndarray], np.ndarray]
 
@@ -94,13 +86,6 @@ def ask(python: str, kind: str, path: str, points: Path, output: Path) -> None:
     )
     if done.returncode:
         raise RuntimeError(f"{kind}: {done.stderr.strip().splitlines()[-1]}")
-
-
-def opencv_formula(points: np.ndarray, matrix: np.ndarray, lens: np.ndarray, fisheye: bool) -> np.ndarray:
-    zero = np.zeros(3)
-    if fisheye:
-        return np.asarray(cv2.fisheye.projectPoints(points[:, None], zero, zero, matrix, lens)[0][:, 0])
-    return np.asarray(cv2.projectPoints(points, zero, zero, matrix, lens)[0][:, 0])
 
 
 def by_vector(values: Sequence[float] | np.ndarray, points: np.ndarray, fisheye: bool = False) -> np.ndarray:
@@ -163,9 +148,9 @@ def by_multical(path: Path, points: np.ndarray) -> np.ndarray:
     return opencv_formula(points, np.array(camera["K"]), np.array(camera["dist"]), False)
 
 
-def exact_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> Iterator[list[str]]:
+def exact_rows(folder: Path) -> Iterator[list[str]]:
     """For each format, over the models that it holds: largest error of the peer, and of the way back to kcal."""
-    for format_name, (file, reader, project) in readers.items():
+    for format_name, (file, reader, project) in readers_of().items():
         errors = []
         for model in FORMATS[format_name].models:
             camera = sample_camera(model)
@@ -180,30 +165,26 @@ def exact_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> It
         yield [format_name, ", ".join(FORMATS[format_name].models), reader, *worst]
 
 
-def fitted_rows(readers: dict[str, tuple[str, str, Project]], folder: Path) -> list[list[str]]:
+def fitted_rows(folder: Path) -> Iterator[list[str]]:
     """Lenses that formats do not hold: the stated maximum, and that of 10,000 points by the peer's reader."""
-    rows = []
     subjects = {"hybrid, 72°": hybrid_camera(0.9, 36.0), "hybrid, 150°": hybrid_camera(0.2, 75.0)}
     for label, camera in (*subjects.items(), ("opencv14", sample_camera("opencv14"))):
         rays, pixels = random_points(camera, 1)
         far = 1e6 * rays
-        for format_name, (file, _, project) in readers.items():
+        for format_name, (file, _, project) in readers_of().items():
             if label == "opencv14" and "opencv14" in FORMATS[format_name].models:
                 continue
             try:
                 done = export_cameras(camera, folder / file, format=format_name)
             except Exception as error:
-                rows.append([label, format_name, "refused", "", "", str(error).split(" (")[0][:40].strip()])
+                yield [label, format_name, "refused", "", "", str(error).split(" (")[0][:40].strip()]
                 continue
             misfit = done.misfits[0]
             assert misfit is not None
             found = np.linalg.norm(project(done.paths[0], far) - pixels, axis=1).max()
             model = done.models[0].removeprefix("LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_")
             true = "yes" if found <= misfit.largest + 1e-6 else "NO"
-            rows.append(
-                [label, format_name, model, f"{misfit.rms:.2g}", f"{misfit.largest:.4g}", f"{found:.4g} {true}"]
-            )
-    return rows
+            yield [label, format_name, model, f"{misfit.rms:.2g}", f"{misfit.largest:.4g}", f"{found:.4g} {true}"]
 
 
 def difference_rows(folder: Path) -> Iterator[list[str]]:
@@ -255,15 +236,13 @@ def readers_of() -> dict[str, Reader]:
 @section("other-programs.md", "formats")
 def formats() -> Iterator[str]:
     heads = ["format", "models", "reader and projection", "peer, px", "back in kcal, px"]
-    with tempfile.TemporaryDirectory() as name:
-        return merged("other-programs.md", "formats", heads, exact_rows(readers_of(), Path(name)))
+    return merged("other-programs.md", "formats", heads, in_folder(exact_rows))
 
 
 @section("other-programs.md", "refitted")
 def refitted() -> Iterator[str]:
     heads = ["lens", "format", "fitted", "RMS, px", "stated maximum, px", "of 10,000 points; within"]
-    with tempfile.TemporaryDirectory() as name:
-        return merged("other-programs.md", "refitted", heads, fitted_rows(readers_of(), Path(name)), keys=2)
+    return merged("other-programs.md", "refitted", heads, in_folder(fitted_rows), keys=2)
 
 
 @section("other-programs.md", "difference")
@@ -271,8 +250,7 @@ def difference() -> Lines:
     if not interpreter("mrcal"):
         raise SystemExit("KCAL_MRCAL names an interpreter that has mrcal")
     yield ["kcal, RMS px", "mrcal, RMS px", "equal frames, px", "mrcal's turn, px", "own turns, px"]
-    with tempfile.TemporaryDirectory() as name:
-        yield from difference_rows(Path(name))
+    yield from in_folder(difference_rows)
 
 
 HEADS = ["program", "direction", "lens", "σ", "pupil", "board", "largest error, px", "reader"]
@@ -314,12 +292,7 @@ def by_gtsam(path: Path, points: np.ndarray) -> np.ndarray:
 
 
 def by_pycolmap(path: Path, points: np.ndarray) -> np.ndarray:
-    import pycolmap
-
-    _, model, width, height, *values = path.read_text().splitlines()[-1].split()
-    size = {"width": int(width), "height": int(height)}
-    camera = pycolmap.Camera(model=model, params=list(map(float, values)), **size)
-    return np.asarray(camera.img_from_cam(points)) - 0.5
+    return np.asarray(pycolmap_camera(path).img_from_cam(points)) - 0.5
 
 
 def by_numpy(path: Path, points: np.ndarray) -> np.ndarray:
@@ -528,5 +501,4 @@ def in_rows(folder: Path) -> Iterator[Row]:
 
 @section("other-programs.md", "round trips")
 def round_trips() -> Iterator[str]:
-    with tempfile.TemporaryDirectory() as name:
-        return table(HEADS, [*out_rows(Path(name)), *in_rows(Path(name))])
+    return table(HEADS, in_folder(lambda folder: [*out_rows(folder), *in_rows(folder)]))

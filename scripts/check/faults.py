@@ -22,9 +22,8 @@ from kcal import Baseline, KcalError, Observations, RigData, calibrate_camera, s
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens import vector_from_rotation
 from scripts.check.rig import BASELINE, NAMES, STRAIGHT, TRUTH, data, generator, landmarks
-from scripts.shared.page import Lines
+from scripts.shared.page import Lines, section
 from scripts.shared.real_captures import load, names
-from scripts.shared.sections import section
 from scripts.shared.simulated import simulated
 
 OFF = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)  # m: of a wrong landmark

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,7 @@ from scipy.io import savemat
 
 from kcal import Camera
 from kcal.lens import export_cameras, import_cameras
-from scripts.shared.page import table
-from scripts.shared.sections import section
+from scripts.shared.page import in_folder, section, table
 
 SIZE, FX, FY, CX, CY = (640, 480), 280.0, 285.0, 330.0, 236.0
 Points = np.ndarray
@@ -124,8 +122,15 @@ RATIONAL = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
                     (0.1, 0.02, 1e-3, -2e-3, 0.01, 0.12, 0.03, 0.002), strict=True))  # fmt: skip
 
 
-def opencv(p: Points, terms: list[float]) -> Points:
-    return np.asarray(cv2.projectPoints(p, np.zeros(3), np.zeros(3), np.array(K), np.array(terms))[0][:, 0])
+def opencv_formula(points: Points, matrix: Points, lens: Points, fisheye: bool = False) -> Points:
+    zero = np.zeros(3)
+    if fisheye:
+        return np.asarray(cv2.fisheye.projectPoints(points[:, None], zero, zero, matrix, lens)[0][:, 0])
+    return np.asarray(cv2.projectPoints(points, zero, zero, matrix, lens)[0][:, 0])
+
+
+def rational(p: Points) -> Points:
+    return opencv_formula(p, np.array(K), np.array([*RATIONAL.values()]))
 
 
 def kb4(p: Points) -> Any:
@@ -184,9 +189,9 @@ READ: dict[str, tuple[tuple[str, Any], Callable[[Points], Points]]] = {
     "Basalt eucm": (basalt("eucm", alpha=0.6, beta=1.1), lambda p: pixels_of(eucm(p))),
     "Basalt ucm": (basalt("ucm", alpha=0.6), lambda p: pixels_of(eucm(p, 0.6, 1.0))),
     "Basalt kb4": (basalt("kb4", **dict(zip(NAMES, TWELVE[:4], strict=False))), lambda p: pixels_of(kb4(p))),
-    "Basalt pinhole-radtan8": (basalt("pinhole-radtan8", **RATIONAL), lambda p: opencv(p, list(RATIONAL.values()))),
-    "multical rational": (multical(), lambda p: opencv(p, list(RATIONAL.values()))),
-    "calib.io OpenCV": (calibio(), lambda p: opencv(p, list(RATIONAL.values()))),
+    "Basalt pinhole-radtan8": (basalt("pinhole-radtan8", **RATIONAL), rational),
+    "multical rational": (multical(), rational),
+    "calib.io OpenCV": (calibio(), rational),
     "Metashape frame": (agisoft("frame"), lambda p: pixels_of(metashape("frame", p), 1.5)),
     "Metashape fisheye": (agisoft("fisheye"), lambda p: pixels_of(metashape("fisheye", p), 1.5)),
     "Metashape equisolid_fisheye": (
@@ -278,16 +283,21 @@ def by_formula(form: str, kind: str, path: Path, points: Points) -> Points:
     return np.stack([fx * plane[0] + cx, fy * plane[1] + cy], 1)
 
 
+def pycolmap_camera(path: Path, **more: int) -> Any:
+    """The last camera of COLMAP's text, as pycolmap has it."""
+    import pycolmap
+
+    _, model, width, height, *values = path.read_text().splitlines()[-1].split()
+    size = {"width": int(width), "height": int(height)}
+    return pycolmap.Camera(model=model, params=list(map(float, values)), **size, **more)
+
+
 def error_of_written(form: str, kind: str, path: Path) -> float:
     """Largest distance of the file's lens from the one that was written."""
     pixels = pixels_everywhere()
     points = 3.0 * WIDE.unproject(pixels)[0].numpy()
     if form == "colmap":
-        import pycolmap
-
-        _, name, width, height, *words = path.read_text().splitlines()[-1].split()
-        theirs = pycolmap.Camera(model=name, width=int(width), height=int(height), params=list(map(float, words)))
-        seen = np.asarray(theirs.img_from_cam(points)) - 0.5
+        seen = np.asarray(pycolmap_camera(path).img_from_cam(points)) - 0.5
     else:
         seen = by_formula(form, kind, path, points)
     # COLMAP sees nothing beside the camera and behind it.
@@ -323,5 +333,4 @@ def rows(folder: Path) -> Iterator[list[str]]:
 
 @section("other-programs.md", "foreign lenses")
 def foreign_lenses() -> Iterator[str]:
-    with tempfile.TemporaryDirectory() as name:
-        return table(["program", "direction", "lens", "largest error, px", "reader"], [*rows(Path(name))])
+    return table(["program", "direction", "lens", "largest error, px", "reader"], in_folder(rows))

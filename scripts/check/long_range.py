@@ -8,15 +8,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from kcal import Camera, Observations, Rig, RigOptions, calibrate_camera, solve_rig
-from kcal.calibrate.camera.result import CalibrationOptions
-from kcal.calibrate.rig.marks import Features
+from kcal import CalibrationOptions, Camera, Features, Observations, Rig, RigOptions, calibrate_camera, solve_rig
 from kcal.calibrate.rig.result import RigResult
 from kcal.calibrate.rig.sources import Baseline, RigData
 from kcal.files import make_folder
@@ -26,9 +24,8 @@ from kcal.lens.pose import side_axes
 from kcal.locate.stereo import sight_lines
 from kcal.rig import read_features
 from kcal.scene.common_errors import line_errors
-from scripts.shared.page import Lines, table
+from scripts.shared.page import Lines, section, table
 from scripts.shared.real_captures import data_folder
-from scripts.shared.sections import section
 
 PICTURE = Path(__file__).parents[2] / "docs" / "measured" / "long-range.png"
 TRIALS = Path("build/long-range")
@@ -146,7 +143,7 @@ def far_shift(rig: Rig, step: Tensor, left: Field, right: Field) -> float:
     return float(((after - before)[:, 0] + own[:, 0])[valid].mean())
 
 
-def causes(rig: Rig, pixels: Tensor) -> list[list[str]]:
+def causes(rig: Rig, pixels: Tensor) -> Lines:
     """Rows: each cause alone beside the pose, with what matches say of it, and what one unit of it does."""
     points = sight_lines(rig, pixels[:, 0], pixels[:, 1]).points
     both = points, rig.right_from_left(points)
@@ -178,20 +175,18 @@ def causes(rig: Rig, pixels: Tensor) -> list[list[str]]:
         "matches, by rows": ((place[:, 1], nothing, nothing), "px at 2000 px"),
         "matches, by inverse range": ((10.0 / ranges, nothing, nothing), "px at 10 m"),
     }
-    rows = []
     for name, ((one, left, right), unit) in tried.items():
         fit = fitted(rig, pixels, one[:, None])
         response = fitted_response(rig, pixels, one)
         amount, sigma = float(fit.step[5]), float(fit.covariance[5, 5].sqrt())
         # A pose that matches were fitted to makes up for an error of one unit that nobody knows of.
         yaw, far = DEGREE * float(response[1]), far_shift(rig, response, left, right)
-        rows.append([
+        yield [
             name, f"{amount:+.2f} ± {sigma:.2f} {unit}", f"{amount / sigma:+.1f}",
             f"{DEGREE * float((fit.step - torch.nn.functional.pad(plain.step, (0, 1)))[1]):+.4f} ± "
             f"{DEGREE * float(fit.covariance[1, 1].sqrt()):.4f}°",
             f"{yaw:+.4f}°", f"{far:+.2f}",
-        ])  # fmt: skip
-    return rows
+        ]  # fmt: skip
 
 
 def fitted_response(rig: Rig, pixels: Tensor, one: Tensor) -> Tensor:
@@ -200,11 +195,10 @@ def fitted_response(rig: Rig, pixels: Tensor, one: Tensor) -> Tensor:
     return -torch.linalg.lstsq(slopes, one[:, None]).solution[:, 0]
 
 
-def halves(rig: Rig, pixels: Tensor) -> list[list[str]]:
+def halves(rig: Rig, pixels: Tensor) -> Lines:
     """Rows: differences of pitch, yaw and roll between halves of the matches, and their χ²."""
     ranges = sight_lines(rig, pixels[:, 0], pixels[:, 1]).points.norm(dim=-1)
     by = {"left, right": pixels[:, 0, 0], "high, low": pixels[:, 0, 1], "near, far": ranges}
-    rows = []
     for name, value in by.items():
         one = value < value.median()
         a, b = fitted(rig, pixels[one]), fitted(rig, pixels[~one])
@@ -212,8 +206,7 @@ def halves(rig: Rig, pixels: Tensor) -> list[list[str]]:
         chi2 = float(difference @ torch.linalg.solve(covariance, difference))
         cells = [f"{DEGREE * v:+.3f} ± {DEGREE * s:.3f}°" for v, s in
                  zip(difference[:3].tolist(), covariance.diagonal()[:3].sqrt().tolist(), strict=True)]  # fmt: skip
-        rows.append([name, *cells, f"{chi2:.1f}"])
-    return rows
+        yield [name, *cells, f"{chi2:.1f}"]
 
 
 def picture(rig: Rig, pixels: Tensor, out: Tensor) -> None:
@@ -267,13 +260,13 @@ def noise() -> Lines:
 
 
 @section("long-range.md", "halves-all")
-def halves_of_all() -> Iterator[str]:
+def halves_of_all() -> Lines:
     rig, every, _ = kept_matches()
     return table(HALVES, halves(rig, every))
 
 
 @section("long-range.md", "halves")
-def halves_of_kept() -> Iterator[str]:
+def halves_of_kept() -> Lines:
     rig, every, out = kept_matches()
     return table(HALVES, halves(rig, every[~out]))
 
@@ -306,7 +299,7 @@ def changes(sizes: tuple[float, ...] = (0.0, 1.0, 3.0, 10.0)) -> Lines:
 
 
 @section("long-range.md", "causes")
-def all_causes(write: bool = False) -> Iterator[str]:
+def all_causes(write: bool = False) -> Lines:
     rig, every, out = kept_matches()
     base = refitted(rig, every[~out])
     if write:

@@ -11,7 +11,7 @@ import collections
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +21,8 @@ from kcal import InputError, Rig
 from kcal.mark.guide import at_shape, propose
 from kcal.mark.shapes import snap
 from scripts.shared.marking_scene import KINDS, Floats, background, finished, inside_of, paint, seen, site_rig
-from scripts.shared.page import table
-from scripts.shared.sections import section
-from scripts.shared.timing import rms as rms_of
+from scripts.shared.page import Lines, section, table
+from scripts.shared.page import rms as rms_of
 
 CONTRASTS = (20.0, 40.0, 80.0)
 BACKGROUNDS = {"plain": 0.0, "hills": 0.8}
@@ -146,8 +145,7 @@ def near(marks: list[Mark | None]) -> list[Mark]:
     return [mark for mark in marks if mark is not None and float(np.hypot(*mark.error)) <= FALSE]
 
 
-def snap_rows(trials: list[Trial]) -> list[list[str]]:
-    rows = []
+def snap_rows(trials: list[Trial]) -> Lines:
     for kind in KINDS[:-1]:
         for contrast in dict.fromkeys(t.contrast for t in trials):
             some = [t for t in trials if (t.kind, t.contrast) == (kind, contrast)]
@@ -155,12 +153,10 @@ def snap_rows(trials: list[Trial]) -> list[list[str]]:
             far = sum(t.snapped is not None for t in some) - len(good)
             shapes = ", ".join(f"{n} {how}" for how, n in collections.Counter(t.how for t in some).most_common())
             stated = math.sqrt(np.mean([mark.sigma**2 for mark in good])) if good else math.nan
-            rows.append([kind, f"{contrast:g}", px(rms(good)), px(stated), covered(good), f"{far}", shapes])
-    return rows
+            yield [kind, f"{contrast:g}", px(rms(good)), px(stated), covered(good), f"{far}", shapes]
 
 
-def match_rows(trials: list[Trial]) -> list[list[str]]:
-    rows = []
+def match_rows(trials: list[Trial]) -> Lines:
     for kind in KINDS:
         for contrast in dict.fromkeys(t.contrast for t in trials):
             some = [t for t in trials if (t.kind, t.contrast) == (kind, contrast) and t.snapped is not None]
@@ -169,8 +165,7 @@ def match_rows(trials: list[Trial]) -> list[list[str]]:
                 good = near(marks)
                 given = sum(mark is not None for mark in marks)
                 cells += [px(rms(good)), covered(good), f"{given - len(good)}", f"{len(marks) - given}"]
-            rows.append(cells)
-    return rows
+            yield cells
 
 
 @functools.cache
@@ -187,9 +182,7 @@ def drawn(each: int, traps: int, contrasts: tuple[float, ...]) -> tuple[list[Tri
     return trials, {kind: [trap(rig, behind["hills"], kind, random) for _ in range(traps)] for kind in kinds}
 
 
-def by_background(
-    heads: list[str], rows: Callable[[list[Trial]], list[list[str]]], trials: list[Trial]
-) -> Iterator[str]:
+def by_background(heads: list[str], rows: Callable[[list[Trial]], Lines], trials: list[Trial]) -> Lines:
     for name in BACKGROUNDS:
         yield from [f"Background: {name}.", ""]
         yield from table(heads, rows([one for one in trials if one.background == name]))
@@ -197,20 +190,20 @@ def by_background(
 
 
 @section("marking.md", "snap", each=1, traps=1, contrasts=(40.0,))
-def snaps(each: int = 30, traps: int = 100, contrasts: tuple[float, ...] = CONTRASTS) -> Iterator[str]:
+def snaps(each: int = 30, traps: int = 100, contrasts: tuple[float, ...] = CONTRASTS) -> Lines:
     heads = ["target", "contrast", "RMS px", "stated σ px", "in 95 % ellipse", "beyond 1 px", "shape found"]
     return by_background(heads, snap_rows, drawn(each, traps, contrasts)[0])
 
 
 @section("marking.md", "match", each=1, traps=1, contrasts=(40.0,))
-def matches(each: int = 30, traps: int = 100, contrasts: tuple[float, ...] = CONTRASTS) -> Iterator[str]:
+def matches(each: int = 30, traps: int = 100, contrasts: tuple[float, ...] = CONTRASTS) -> Lines:
     heads = ["target", "contrast", "match: RMS px", "in 95 %", "false", "refused"]
     heads += ["at its shape: RMS px", "in 95 %", "false", "refused"]
     return by_background(heads, match_rows, drawn(each, traps, contrasts)[0])
 
 
 @section("marking.md", "false", each=1, traps=1, contrasts=(40.0,))
-def false_proposals(each: int = 30, traps: int = 100, contrasts: tuple[float, ...] = CONTRASTS) -> Iterator[str]:
+def false_proposals(each: int = 30, traps: int = 100, contrasts: tuple[float, ...] = CONTRASTS) -> Lines:
     trials, caught = drawn(each, traps, contrasts)
     rows = [
         (kind, len(found), sum(f is not None for f in found), sum(f is True for f in found))

@@ -8,8 +8,6 @@ Seconds of the processor are given beside those of the clock: on a busy machine 
 from __future__ import annotations
 
 import contextlib
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -21,8 +19,9 @@ from playwright.sync_api import sync_playwright
 
 from kcal.io.images import write_png
 from kcal.io.rig_file import save_rig
+from scripts.shared.children import marking_server
 from scripts.shared.marking_scene import background, finished, site_rig
-from scripts.shared.memory import peak_megabytes
+from scripts.shared.page import peak_megabytes
 
 SIZE = 6000, 4000
 _DRAWN = "s => [...kcal.views[s].tiles.kept.values()].some(t => t.canvas)"
@@ -73,23 +72,18 @@ def main() -> None:
             write_png(folder / f"{word}.png", finished(light, 1.5, np.random.default_rng(side)))
         save_rig(rig, folder / "rig.json")
         start = time.perf_counter()
-        command = [sys.executable, "-m", "kcal", "mark", "left.png", "right.png", "--rig", "rig.json", "-o", "m.csv"]
-        command += ["--port", "0", "--no-browser"]
-        server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder)
-        try:
-            assert server.stdout is not None
-            address = server.stdout.readline().split()[-1]
+        with marking_server(folder, "--rig", "rig.json", "-o", "m.csv") as (address, server):
             print(
-                f"command to address: {time.perf_counter() - start:.1f} s, processor {processor(server.pid):.1f} s; "
-                f"server at most {peak_megabytes(server.pid):.0f} MB"
+                f"command to address: {time.perf_counter() - start:.1f} s, processor {processor(server):.1f} s; "
+                f"server at most {peak_megabytes(server):.0f} MB"
             )
             with sync_playwright() as playwright:
                 browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
                 page = browser.new_page(viewport={"width": 1366, "height": 768})
-                before = processor(server.pid) + processor()
+                before = processor(server) + processor()
                 page.goto(address, wait_until="commit")
                 page.wait_for_function(f"() => window.kcal && ['left', 'right'].every({_DRAWN})")
-                spent = processor(server.pid) + processor() - before
+                spent = processor(server) + processor() - before
                 clock = page.evaluate("performance.now()") / 1000
                 print(f"address to both pictures: {clock:.2f} s, processor {spent:.2f} s")
                 page.wait_for_timeout(1000)
@@ -108,11 +102,8 @@ def main() -> None:
                 page.wait_for_timeout(2000)
                 dragged(page, "dragging a mark at 10x, with curve and range", (3000, 2000))
                 heap = page.evaluate("performance.memory.usedJSHeapSize / 1e6")
-                print(f"server at most {peak_megabytes(server.pid):.0f} MB; heap of the page {heap:.0f} MB")
+                print(f"server at most {peak_megabytes(server):.0f} MB; heap of the page {heap:.0f} MB")
                 browser.close()
-        finally:
-            server.terminate()
-            server.wait()
 
 
 if __name__ == "__main__":

@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -22,9 +21,7 @@ from torch import Tensor
 from kcal import Baseline, Camera, KcalError, MeasuredPosition, RigData, solve_rig
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.locate.moving import CLOCK, MovingOptions, MovingTrack, Sighting, match_moving
-from scripts.shared.page import table
-from scripts.shared.sections import section
-from scripts.shared.timing import rms
+from scripts.shared.page import Lines, rms, section, table, timed
 
 CAMERA = Camera.build(focal=(1600, 1600), center=(959.5, 539.5), size=(1920, 1080), model="pinhole")
 CENTERS = torch.tensor([[0.0, 0, 0], [10.0, 0, 0]], dtype=torch.float64)
@@ -165,14 +162,9 @@ def simulated(name: str, seed: int) -> Site:
 def one_draw(name: str, seed: int) -> Outcome:
     """Errors of a rig from one simulated site."""
     tracks, sightings, positions, tape, attitude, truth = simulated(name, seed)
-    begin = time.process_time()
-    found = match_moving(tracks, sightings, (CAMERA, CAMERA), NAMES, positions)
-    rig = solve_rig(
-        RigData(
-            cameras=(CAMERA, CAMERA), names=NAMES, landmarks=found.landmarks, positions=positions, baselines=(tape,)
-        )
-    )
-    cpu = time.process_time() - begin
+    found, matching = timed(match_moving, tracks, sightings, (CAMERA, CAMERA), NAMES, positions)
+    data = RigData(cameras=(CAMERA, CAMERA), names=NAMES, landmarks=found.landmarks, positions=positions)
+    rig, solving = timed(solve_rig, dataclasses.replace(data, baselines=(tape,)))
     relative = rig.stereo().right_from_left_rotation.detach() @ (attitude[1] @ attitude[0].T).T
     error, covariance = vector_from_rotation(relative), rig.relative_covariance()[:3, :3]
     amount, spread = rig.effects()[CLOCK]
@@ -183,7 +175,7 @@ def one_draw(name: str, seed: int) -> Outcome:
     return Outcome(
         math.degrees(float(error[1])), math.degrees(float(covariance[1, 1].sqrt())),
         float(error @ torch.linalg.solve(covariance, error)), found.clock + prior * amount - LATE, prior * spread,
-        sum(right) / len(right), false, cpu,
+        sum(right) / len(right), false, matching + solving,
     )  # fmt: skip
 
 
@@ -215,5 +207,5 @@ HEADS = (
 
 
 @section("moving.md", "moving", kinds=tuple(KINDS)[:1], seeds=range(1))
-def moving(kinds: tuple[str, ...] = tuple(KINDS), seeds: range = range(30)) -> Iterator[str]:
+def moving(kinds: tuple[str, ...] = tuple(KINDS), seeds: range = range(30)) -> Lines:
     return table(HEADS, (row_of(name, seeds) for name in kinds))

@@ -44,9 +44,7 @@ import pytest
 
 from scripts.check.mutations import Site, sites
 from scripts.shared.children import children
-from scripts.shared.page import Line, Lines, laid_out, read_section
-from scripts.shared.sections import section
-from scripts.shared.timing import show
+from scripts.shared.page import Line, Lines, laid_out, read_section, section, show
 
 HARMLESS = {
     "cc931d9fd18dd576": "`repr` or `compare` of a field that follows from the others",

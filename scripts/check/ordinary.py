@@ -19,7 +19,6 @@ import math
 import random
 import statistics
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,18 +26,16 @@ import cv2
 import torch
 from torch import Tensor
 
-from kcal import Camera, KcalError, Localizer, Observations, calibrate_rig
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal import CalibrationOptions, Camera, KcalError, Localizer, Observations, calibrate_camera, calibrate_rig
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens import camera_difference, vector_from_rotation
 from kcal.locate.stereo import Localization
 from kcal.report import camera_verdict
 from scripts.shared.children import interpreter
 from scripts.shared.held_out import Projection, of_halves
-from scripts.shared.page import Lines, table
+from scripts.shared.page import NOT_KEPT, Kept, Lines, Record, section, table, timed
 from scripts.shared.peer_lenses import END, fisheye, opencv, splined_camera
 from scripts.shared.real_captures import RealCapture, load, names
-from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 
 MODELS = ("kcal", "opencv5", "opencv8", "fisheye", "mrcal")
 LEAST_P, RATIOS, WORST = 0.01, (0.5, 1.2), 1.04
@@ -71,16 +68,14 @@ def judged(name: str) -> Record:
 
 def _whole(capture: RealCapture) -> Record:
     """What a user gets of all views: RMS, the verdict, and its worst sentence; or why they are refused."""
-    start = time.process_time()
     try:
-        result = calibrate_camera(capture.seen, CalibrationOptions())
+        result, spent = timed(calibrate_camera, capture.seen, CalibrationOptions())
     except KcalError as error:
         return {"refused": str(error)}
-    fitted = time.process_time()
-    verdict = camera_verdict(result)
+    verdict, spent_on_report = timed(camera_verdict, result)
     doubts = [finding.text for finding in verdict.findings if finding.severity == "doubt"]
     worst = next(iter([verdict.reason] if verdict.stops else [*result.warnings, *doubts]), "")
-    seconds = {"cpu_s": fitted - start, "report_cpu_s": time.process_time() - fitted}
+    seconds = {"cpu_s": spent, "report_cpu_s": spent_on_report}
     return {"rms": result.rms, "yes": verdict.usable, "worst": worst, **seconds}
 
 
@@ -89,13 +84,12 @@ def _defaults(halves: tuple[RealCapture, RealCapture], record: Record) -> list[C
     cameras: list[Camera] = []
     record |= {"refused": [], "warnings": [], "noise": [], "cpu_s": []}
     for half in halves:
-        start = time.process_time()
         try:
-            result = calibrate_camera(half.seen, CalibrationOptions())
+            result, spent = timed(calibrate_camera, half.seen, CalibrationOptions())
         except KcalError as error:
             record["refused"].append(str(error))
             continue
-        record["cpu_s"].append(time.process_time() - start)
+        record["cpu_s"].append(spent)
         record["warnings"].append(list(result.warnings))
         record["noise"].append(result.noise)
         cameras.append(result.camera)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime
 import math
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import erfa
@@ -26,8 +26,7 @@ from kcal.lens import bake, rotation_from_vector, save_onnx, undistort_maps
 from kcal.lens.views import new_pinhole
 from kcal.locate import enu_to_geodetic, geodetic_to_enu
 from kcal.stars.sky import Air, StarCatalog, observed_directions
-from scripts.shared.page import table
-from scripts.shared.sections import section
+from scripts.shared.page import Lines, section, table
 
 Numbers = Sequence[mpf]
 SIZE = (1920, 1080)
@@ -96,9 +95,8 @@ def draw_points(camera: Camera, count: int) -> Tensor:
     return (rays * away)[valid]
 
 
-def lens_rows(count: int) -> list[list[str]]:
+def lens_rows(count: int) -> Lines:
     """Projection, unprojection and derivatives of each lens."""
-    rows = []
     for name in LENSES:
         camera = camera_of(name)
         values, points = exactly(camera.params.detach()), draw_points(camera, count)
@@ -108,16 +106,15 @@ def lens_rows(count: int) -> list[list[str]]:
             pixels, valid = camera.project(points.to(dtype))
             assert bool(valid.all())
             off[kind] = max(distance(pixel, wanted) for pixel, wanted in zip(pixels.tolist(), true, strict=True))
-        rows.append([f"`project`, {name}, px", *shown(off)])
+        yield [f"`project`, {name}, px", *shown(off)]
         exact_pixels = torch.tensor([[float(u), float(v)] for u, v in true], dtype=torch.float64)
         for kind, dtype in PIXELS_OF.items():
             rays, valid = camera.unproject(exact_pixels.to(dtype))
             assert bool(valid.all())
             again = [reference_pixel(exactly(ray), values, name) for ray in rays]
             off[kind] = max(distance(pixel, wanted) for pixel, wanted in zip(again, true, strict=True))
-        rows.append([f"`unproject`, {name}, px of its ray's pixel", *shown(off)])
-        rows += derivative_rows(camera, name, points[: max(1, count // 20)], values)
-    return rows
+        yield [f"`unproject`, {name}, px of its ray's pixel", *shown(off)]
+        yield from derivative_rows(camera, name, points[: max(1, count // 20)], values)
 
 
 def derivative_rows(camera: Camera, name: str, points: Tensor, values: Numbers) -> list[list[str]]:
@@ -134,8 +131,11 @@ def derivative_rows(camera: Camera, name: str, points: Tensor, values: Numbers) 
         place = exactly(point)
         for kind, at in (("points", place), ("parameters", list(values))):
             found = torch.stack(own[kind])
-            for column in range(len(at)):
-                true = _slope(place, values, name, kind, column)
+            function = {
+                "points": lambda p: reference_pixel(p, values, name),
+                "parameters": lambda v: reference_pixel(place, v, name),  # noqa: B023
+            }[kind]
+            for column, true in enumerate(_slopes(function, at)):
                 size = max(abs(value) for value in true) or mpf(1)
                 gap = max(abs(mpf(a) - b) for a, b in zip(found[:, column].tolist(), true, strict=True))
                 errors[kind] = max(errors[kind], float(gap / size))
@@ -144,19 +144,18 @@ def derivative_rows(camera: Camera, name: str, points: Tensor, values: Numbers) 
     ]
 
 
-def _slope(place: Numbers, values: Numbers, name: str, kind: str, column: int) -> list[mpf]:
-    """Central difference in 50 digits, whose own error is some 1e-30."""
-    step, ends = mpf(10) ** -17, []
-    for sign in (1, -1):
-        moved = {"points": list(place), "parameters": list(values)}
-        moved[kind][column] += sign * step
-        ends.append(reference_pixel(moved["points"], moved["parameters"], name))
-    return [(a - b) / (2 * step) for a, b in zip(*ends, strict=True)]
+def _slopes(function: Callable[[Numbers], Sequence[mpf]], at: Numbers) -> list[list[mpf]]:
+    """Central differences by each number in 50 digits, whose own error is some 1e-30."""
+    step, columns = mpf(10) ** -17, []
+    for axis in range(len(at)):
+        ends = [function([*at[:axis], at[axis] + end, *at[axis + 1 :]]) for end in (step, -step)]
+        columns.append([(a - b) / (2 * step) for a, b in zip(*ends, strict=True)])
+    return columns
 
 
-def table_rows(count: int) -> list[list[str]]:
+def table_rows(count: int) -> Lines:
     """What tables, maps, files and ONNX graphs keep of a camera."""
-    rows, camera = list[list[str]](), camera_of("opencv5")
+    camera = camera_of("opencv5")
     maps, flat = undistort_maps(camera), new_pinhole(camera)
     values, generator = exactly(camera.params.detach()), torch.Generator().manual_seed(1)
     worst = 0.0
@@ -164,34 +163,33 @@ def table_rows(count: int) -> list[list[str]]:
         fx, fy, cx, cy, *_ = exactly(flat.params.detach())
         wanted = reference_pixel([(u - cx) / fx, (v - cy) / fy, mpf(1)], values, "opencv5")
         worst = max(worst, distance((float(maps.map_x[v, u]), float(maps.map_y[v, u])), wanted))
-    rows.append(["`undistort_maps`, float32 maps of 1920 columns, px", "–", f"{worst:.1e}"])
+    yield ["`undistort_maps`, float32 maps of 1920 columns, px", "–", f"{worst:.1e}"]
     hybrid = load_rig(SAMPLE).left
     for name, lens in (("opencv5", camera), ("default lens", hybrid)):
         baked, points = bake(lens, tolerance=1e-4), draw_points(camera, 10 * count)
         there, valid = baked.project(points)
         directions, known = lens.project_rays(points)
         gap = (there - directions)[valid & known].norm(dim=-1).max()
-        rows.append([f"`bake` to 1e-4, {name}, px (stated {max(baked.bound):.1e})", f"{float(gap):.1e}", "–"])
+        yield [f"`bake` to 1e-4, {name}, px (stated {max(baked.bound):.1e})", f"{float(gap):.1e}", "–"]
         with tempfile.TemporaryDirectory() as folder, torch.no_grad():
             again = load_camera(save_camera(lens, Path(folder, "camera.json")))
             gap = (again.project(points)[0] - lens.project(points)[0]).abs().max()
-            rows.append([f"`save_camera`, `load_camera`, {name}, px", f"{float(gap):.1e}", "–"])
+            yield [f"`save_camera`, `load_camera`, {name}, px", f"{float(gap):.1e}", "–"]
             quiet = onnxruntime.SessionOptions()
             quiet.log_severity_level = 3
             session = onnxruntime.InferenceSession(save_onnx(lens, points[:4], Path(folder, "camera.onnx")), quiet)
             ran = torch.from_numpy(session.run(None, {session.get_inputs()[0].name: points.numpy()})[0])
             gap = (ran - lens.project(points)[0]).abs().max()
-            rows.append([f"`save_onnx` in onnxruntime, {name}, px", f"{float(gap):.1e}", "–"])
-    return rows
+            yield [f"`save_onnx` in onnxruntime, {name}, px", f"{float(gap):.1e}", "–"]
 
 
-def pair_rows(count: int) -> list[list[str]]:
+def pair_rows(count: int) -> Lines:
     """Triangulation of exact pixels, and the sigma of the inverse range, of two unlike turned cameras."""
     left, right = (camera_of(name) for name in ("opencv5", "opencv14"))
     turn = rotation_from_vector(torch.tensor([0.01, -0.02, 0.015], dtype=torch.float64))
     center = torch.tensor([BASELINE, 0.3, -0.2], dtype=torch.float64)
     rig = Rig.pair(left, right, turn, -turn @ center)
-    pair, rows = Localizer(rig, pixel_sigma=SIGMA), []
+    pair = Localizer(rig, pixel_sigma=SIGMA)
     matrix, shift = [exactly(line) for line in turn], exactly(-turn @ center)
     lefts, rights = exactly(left.params.detach()), exactly(right.params.detach())
 
@@ -214,22 +212,13 @@ def pair_rows(count: int) -> list[list[str]]:
             if kind == "float64":
                 for point, sigma in list(zip(points, found.inverse_range_sigma.tolist(), strict=True))[:5]:
                     spread = max(spread, abs(float(mpf(sigma) / _sigma(exactly(point), seen) - 1)))
-        rows.append([f"`Localizer` at {away:,.0f} m, baseline 10 m, relative", *shown(off)])
-        rows.append([f"its σ of the inverse range at {away:,.0f} m, relative to first order", f"{spread:.1e}", "–"])
-    return rows
+        yield [f"`Localizer` at {away:,.0f} m, baseline 10 m, relative", *shown(off)]
+        yield [f"its σ of the inverse range at {away:,.0f} m, relative to first order", f"{spread:.1e}", "–"]
 
 
 def _sigma(point: Numbers, seen: Callable[[Numbers], list[mpf]]) -> mpf:
     """Standard deviation of one over the range, to first order, from the marks' noise alone."""
-    step, columns = mpf(10) ** -17, []
-    for axis in range(3):
-        ends = []
-        for sign in (1, -1):
-            moved = list(point)
-            moved[axis] += sign * step
-            ends.append(seen(moved))
-        columns.append([(a - b) / (2 * step) for a, b in zip(*ends, strict=True)])
-    rows = mpmath.matrix(columns).T
+    rows = mpmath.matrix(_slopes(seen, point)).T
     covariance = mpf(SIGMA) ** 2 * (rows.T * rows) ** -1
     away = mpmath.sqrt(sum(value * value for value in point))
     slope = mpmath.matrix([-value / away**3 for value in point])
@@ -245,9 +234,9 @@ def reference_ecef(lat: mpf, lon: mpf, height: mpf) -> list[mpf]:
     return [out * mpmath.cos(east), out * mpmath.sin(east), ((1 - square) * normal + height) * sine]
 
 
-def geodesy_rows(count: int) -> list[list[str]]:
+def geodesy_rows(count: int) -> Lines:
     """ENU and geodetic coordinates, both ways, in meters, over the whole Earth."""
-    generator, rows = torch.Generator().manual_seed(3), []
+    generator = torch.Generator().manual_seed(3)
     for away in (1e3, 1e5, 1e7):
         worst = {"there": 0.0, "back": 0.0}
         for number in range(count // 4):
@@ -265,14 +254,13 @@ def geodesy_rows(count: int) -> list[list[str]]:
             true = [sum(k * (p - q) for k, p, q in zip(axis, a, b, strict=True)) for axis in axes]
             worst["there"] = max(worst["there"], distance(enu.tolist(), true))
             worst["back"] = max(worst["back"], distance(own[0].tolist(), true))
-        rows.append([f"`enu_to_geodetic` to {away / 1e3:,.0f} km, m", f"{worst['there']:.1e}", "–"])
-        rows.append([f"`geodetic_to_enu` to {away / 1e3:,.0f} km, m", f"{worst['back']:.1e}", "refused"])
-    return rows
+        yield [f"`enu_to_geodetic` to {away / 1e3:,.0f} km, m", f"{worst['there']:.1e}", "–"]
+        yield [f"`geodetic_to_enu` to {away / 1e3:,.0f} km, m", f"{worst['back']:.1e}", "refused"]
 
 
-def star_rows() -> list[list[str]]:
+def star_rows() -> Lines:
     """Directions of the bundled stars against ERFA's whole computation, in seconds of arc."""
-    catalog, rows = StarCatalog.bundled(), []
+    catalog = StarCatalog.bundled()
     for year, lat in ((2026, 52.0), (2026, -33.0), (1990, 0.0)):
         time = datetime.datetime(year, 3, 1, 3, 4, 5, tzinfo=datetime.UTC)
         place, air = Origin(lat=lat, lon=4.4, height=100.0), Air.at_height(100.0)
@@ -286,8 +274,7 @@ def star_rows() -> list[list[str]]:
         true = np.stack([np.sin(zenith) * np.sin(azimuth), np.sin(zenith) * np.cos(azimuth), np.cos(zenith)], -1)
         gap = np.linalg.norm(own - true, axis=-1)[up].max() * 206264.8
         name = f"`observed_directions` {year} at {lat:g}°, {up.sum():,} stars above 5°, seconds of arc"
-        rows.append([name, f"{gap:.1e}", "–"])
-    return rows
+        yield [name, f"{gap:.1e}", "–"]
 
 
 def shown(errors: dict[str, float]) -> list[str]:
@@ -337,20 +324,20 @@ HEAD = ["quantity", "largest error, float64", "inputs of float32"]
 
 
 @section("precision.md", "lens precision", points=20)
-def lens_precision(points: int = 200) -> Iterator[str]:
+def lens_precision(points: int = 200) -> Lines:
     return table(HEAD, lens_rows(points))
 
 
 @section("precision.md", "stored precision", points=20)
-def stored_precision(points: int = 200) -> Iterator[str]:
+def stored_precision(points: int = 200) -> Lines:
     return table(HEAD, table_rows(points))
 
 
 @section("precision.md", "position precision", points=20)
-def position_precision(points: int = 200) -> Iterator[str]:
-    return table(HEAD, pair_rows(points) + geodesy_rows(points) + star_rows())
+def position_precision(points: int = 200) -> Lines:
+    return table(HEAD, [*pair_rows(points), *geodesy_rows(points), *star_rows()])
 
 
 @section("precision.md", "limits")
-def limits() -> Iterator[str]:
+def limits() -> Lines:
     return table(["what is asked", "answer"], limit_rows())

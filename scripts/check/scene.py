@@ -29,13 +29,9 @@ import torch
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from torch import Tensor
 
-from kcal import Baseline, Features, Landmarks, RigData
-from kcal.calibrate.camera.calibrate import calibrate_camera
+from kcal import Baseline, Camera, Features, InputError, Landmarks, RigData, RigOptions, calibrate_camera, solve_rig
 from kcal.calibrate.rig.result import RigResult
-from kcal.calibrate.rig.solve import RigOptions, solve_rig
 from kcal.corners.match import keypoints
-from kcal.errors import InputError
-from kcal.lens.camera import Camera
 from kcal.lens.pose import vector_from_rotation
 from kcal.lens.rig import Rig
 from kcal.locate.localizer import Localizer
@@ -46,12 +42,10 @@ from kcal.scene.refine import refine_matches
 from kcal.sim.captures import TrueRig, drawn_rig
 from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import FOCAL_MM
+from scripts.shared.captures import as_camera, capture
 from scripts.shared.long_range import ORIGIN, landmarks_of, matches_of, with_noise
-from scripts.shared.page import DOCS, Lines, table
-from scripts.shared.sections import NOT_KEPT, Kept, Record, section
+from scripts.shared.page import DOCS, NOT_KEPT, Kept, Lines, Record, rms, section, share, table, timed
 from scripts.shared.terrain import Terrain, Weather
-from scripts.shared.timing import rms, share
-from scripts.shared.traced import as_camera, capture
 
 TAPE = 0.005  # meters
 MARK = 0.1  # px, of targets
@@ -188,9 +182,7 @@ def matches(conditions: tuple[str, ...] = tuple(CONDITIONS)) -> Lines:
             own = slice(0, scene.counts[0].used)
             of_three = judged(scene.features.pixels[own], None, 1, weathers[0], visible)
             yield told(condition, "kcal, three pairs", of_three, seconds)
-        start = time.process_time()
-        pixels = opencv_matches(pairs[0])
-        spent = time.process_time() - start
+        pixels, spent = timed(opencv_matches, pairs[0])
         yield told(condition, "OpenCV SIFT + USAC", judged(pixels, None, 1, weathers[0], visible), spent)
 
 
@@ -424,9 +416,7 @@ def speed(counts: tuple[int, ...] = (2000, 20_000)) -> Iterator[str]:
         seen = (valid & RIG.left.inside(left) & RIG.right.inside(right)).nonzero()[:count, 0]
         places = left[seen], right[seen], torch.full((len(seen), 1, 1), 0.02).double() * torch.eye(2).double()
         data = rig_data((cameras[0], cameras[1]), drawn(places, 1, draw, 0.03), draw)
-        start = time.process_time()
-        solve_rig(data)
-        spent.append(time.process_time() - start)
+        spent.append(timed(solve_rig, data)[1])
     rows = [(f"{n:,}", f"{s:.1f}", f"{s / spent[0]:.1f}") for n, s in zip(counts, spent, strict=True)]
     return table(("matches", "CPU s", "times the first"), rows)
 
@@ -540,20 +530,18 @@ def errors_of(seed: int) -> Errors:
     return Errors(kind[good], lines[0].off, lines[1].off, sigma, yaw.rad2deg())
 
 
-def rows(found: list[Errors]) -> list[list[str]]:
+def rows(found: list[Errors]) -> Iterator[list[str]]:
     """Rows of the table."""
     every = Errors(*(torch.cat(parts) for parts in zip(*found, strict=True)))
-    rows = []
     for number, name in enumerate((*KINDS, "all")):
         own = (every.kind == number) | (number == len(KINDS))
         turns = [float(one.yaw[(one.kind == number) | (number == len(KINDS))].sum()) for one in found]
         error = torch.tensor(turns)
-        rows.append([
+        yield [
             name, f"{int(own.sum()) / len(found):.0f}", f"{rms(every.noisy[own]):.3f}", f"{rms(every.sigma[own]):.3f}",
             f"{rms(every.clean[own]):.3f}", f"{float(every.clean[own].abs().median()):.3f}", f"{rms(error):.5f}°",
             f"{float(error.mean()):+.5f} ± {float(error.std()) / math.sqrt(len(found)):.5f}°",
-        ])  # fmt: skip
-    return rows
+        ]  # fmt: skip
 
 
 HEADS = ("what", "matches", "RMS, px", "σ of noise", "of it repeats, RMS", "median", "yaw, RMS", "yaw, mean")

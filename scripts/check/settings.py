@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from typing import Any
 
 import numpy as np
@@ -22,16 +21,14 @@ import torch
 from torch import Tensor
 
 from kcal import Camera, Observations, calibrate_camera
-from kcal.calibrate.camera.at_setting import InterpolatedCamera, camera_at_setting
+from kcal.calibrate.camera.at_setting import camera_at_setting
 from kcal.lens import LensSetting
 from kcal.lens.uncertainty import pixel_covariance, pixel_errors
 from kcal.sim.raytrace import Misalignment, focal_length, system_matrix
 from kcal.sim.truth import TruthLens
-from scripts.shared.page import Lines
+from scripts.shared.captures import BOARD, MACHINE_VISION, captures, printed
+from scripts.shared.page import NOT_KEPT, Kept, Lines, Record, section, timed
 from scripts.shared.peer_lenses import calibrated
-from scripts.shared.prescriptions import MACHINE_VISION
-from scripts.shared.sections import NOT_KEPT, Kept, Record, section
-from scripts.shared.traced import BOARD, captures, printed
 
 LENS = MACHINE_VISION
 SETTINGS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -104,9 +101,7 @@ def judged(camera: Camera, truth: TruthLens) -> dict[str, float]:
 
 def interpolated(cameras: list[Camera], setting: float, truth: TruthLens) -> dict[str, float]:
     """One that `camera_at_setting` made."""
-    begin = time.process_time()
-    found: InterpolatedCamera = camera_at_setting(cameras, {"setting": setting})
-    used = time.process_time() - begin
+    found, used = timed(camera_at_setting, cameras, {"setting": setting})
     return judged(found.camera, truth) | {"cpu": used, "curve": found.interpolation_px}
 
 

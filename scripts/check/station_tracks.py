@@ -25,8 +25,7 @@ from kcal.lens.pose import enu_from_cam
 from kcal.locate.geodesy import anchor, ecef_from_enu_rotation, enu_to_geodetic, geodetic_to_enu
 from kcal.pipeline.pairing import ObjectViews
 from kcal.track import AssociationOptions, ClockPrior, Detections, Motion, Tracker, TrackOptions, group_objects
-from scripts.shared.page import Lines
-from scripts.shared.sections import section
+from scripts.shared.page import Lines, section
 from scripts.shared.station_scenes import ORIGIN, drawn_errors, marks, ring
 
 BOX_PX, MISSED, FALSE = 1.0, 0.15, 1.0

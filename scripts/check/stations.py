@@ -20,7 +20,6 @@ standard deviations.
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Callable
 
@@ -31,11 +30,9 @@ from torch import Tensor
 from kcal import Camera, Localizer, Rig
 from kcal.locate.stereo import Localization, PositionStatus
 from kcal.locate.views import fit_views
-from scripts.shared.page import DOCS, Line, Lines
+from scripts.shared.page import DOCS, Lines, section, show, timed
 from scripts.shared.real_captures import data_folder
-from scripts.shared.sections import section
 from scripts.shared.station_scenes import drawn_errors, marks, ring, targets
-from scripts.shared.timing import show
 
 OK = int(PositionStatus.OK)
 _CHI2_95 = 7.814727903251179
@@ -164,13 +161,11 @@ def peers(count: int = 20_000) -> Lines:
                 warnings.simplefilter("ignore")
                 # Compilers work once for each size.
                 solve(some if fewer == 1 else some[:20])
-                start = time.process_time()
-                result = solve(some)
-                seconds = (time.process_time() - start) / len(some) * 1e6
+                result, seconds = timed(solve, some)
             error = 1e3 * np.linalg.norm(result - cloud.numpy()[: len(some)], axis=1)
             none = ~np.isfinite(error)
             middle, high = np.quantile(error[~none], [0.5, 0.95])
-            times = f"{none.mean():.1%}", f"{seconds:.1f}"
+            times = f"{none.mean():.1%}", f"{seconds / len(some) * 1e6:.1f}"
             yield [views, f"{missing:.0%}", f"{wrong:.0%}", name, f"{middle:.2f}", f"{high:.2f}", *times]
 
 
@@ -282,7 +277,7 @@ def _contains(polygon: np.ndarray, point: np.ndarray) -> bool:
 
 @section("stations.md", "real")
 @torch.no_grad()
-def real() -> list[Line]:
+def real() -> Lines:
     """Table for the four cameras and the walking person: two cameras' points seen by the others."""
     data = np.load(data_folder() / "stations" / "pose2sim.npz")
     cameras = []
@@ -304,7 +299,12 @@ def real() -> list[Line]:
     first = free(torch.where(seen[..., None], pixels, math.nan))
     four = (first.status == OK) & seen.all(-1)
     sigma = float((first.reprojection[four].square().sum(-1).median() / 4.351).sqrt())
-    rows = []
+    again, _ = rig(first.enu[four])
+    off = (pixels[four] - again).mean(0).norm(dim=-1).tolist()
+    note = f"{len(pixels)} joints; noise of a mark along an axis {sigma:.2f} px, from the joints that all four see; "
+    offsets = ", ".join(f"{name} {one:.1f}" for name, one in zip(rig.names, off, strict=True))
+    yield note + f"mean offset of a camera's marks: {offsets} px."
+    yield ["cameras", "joints located", "of them a view left out", "contradictions", "RMS px", "held out, median px"]
     alone = [(f"without {name}", torch.arange(4) != c) for c, name in enumerate(rig.names)]
     for name, using in [("all four", torch.ones(4, dtype=torch.bool)), *alone]:
         found = Localizer(rig, pixel_sigma=sigma)(pixels, seen & using)
@@ -312,17 +312,9 @@ def real() -> list[Line]:
         misses = (rig(found.enu)[0] - pixels).norm(dim=-1)
         own, torn = misses[found.used & ok[:, None]], found.status == int(PositionStatus.CONTRADICTION)
         held = misses[ok][seen[ok] & ~using]
-        rows.append(
-            [name, int(ok.sum()), int((found.bad.any(-1) & ok).sum()), int(torn.sum()),
-             f"{float(own.square().mean().sqrt()):.2f}", f"{float(held.median()):.2f}" if len(held) else ""]
-        )  # fmt: skip
-    heads = ["cameras", "joints located", "of them a view left out", "contradictions", "RMS px", "held out, median px"]
-    again, _ = rig(first.enu[four])
-    off = (pixels[four] - again).mean(0).norm(dim=-1).tolist()
-    note = f"{len(pixels)} joints; noise of a mark along an axis {sigma:.2f} px, from the joints that all four see; "
-    offsets = ", ".join(f"{name} {one:.1f}" for name, one in zip(rig.names, off, strict=True))
-    note += f"mean offset of a camera's marks: {offsets} px."
-    return [note, heads, *rows]
+        counts = [int(some.sum()) for some in (ok, found.bad.any(-1) & ok, torn)]
+        median = f"{float(held.median()):.2f}" if len(held) else ""
+        yield [name, *counts, f"{float(own.square().mean().sqrt()):.2f}", median]
 
 
 @section("stations.md", "picture")

@@ -32,9 +32,7 @@ from kcal.pipeline.pairing import ObjectViews
 from kcal.pipeline.tracks import Tracker, TrackOptions, Tracks
 from kcal.rig import RigCovariance, planned_rig
 from kcal.track import ClockPrior, Motion
-from scripts.shared.page import Lines
-from scripts.shared.sections import section
-from scripts.shared.timing import rms
+from scripts.shared.page import Lines, rms, section
 
 START = datetime.datetime(2026, 1, 1)
 

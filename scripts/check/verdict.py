@@ -1,6 +1,23 @@
 """Does the verdict say yes only to captures that deserve it? Captures with one planted fault each, and clean ones.
 
 Seeds below 200 were for setting the thresholds.
+
+Does `kcal check` judge right? Its verdict on calibrations whose truth is known.
+
+Captures are those of `scripts.check.captures_that_move`: three traced lenses in turn, printed boards, noise of
+0.08 px; 5, 8, 12 and 20 views in turn, every other one by hand. Each is calibrated with the default lens, whose
+intervals should be true, and with opencv5, which describes neither lens nor board, so that they should not. A second
+capture of the same lens and board, with as many views, is what `--against` gets. Truth: the share of the image in which
+the true lens lies in the stated 95 % ellipses, at infinity after the best-fit rotation. Intervals count as true where
+it is more than half: places of one calibration go together, so that true intervals have all of the image inside or,
+seldom, little of it.
+
+Is it said that pixels are not square, where they are and where they are not?
+
+`--stretch 1.01`: rows longer or shorter by 1 %, in turn; 1 shows false alarms. Truth: traced lenses in turn and printed
+boards, as in `scripts.check.captures_that_move`; 8 to 20 views, 0.05 to 0.2 px of noise; boards upright (within 2
+degrees) in half of the captures, turned by up to 90 degrees in the others; a quarter of the captures by hand. A camera
+is said to have pixels that are not square if a warning of its calibration contains "pixels are not square".
 """
 
 from __future__ import annotations
@@ -9,28 +26,29 @@ import dataclasses
 import itertools
 import math
 import random
+import statistics
 import time
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from kcal import Board, Camera, KcalError, Observations, RigData, solve_rig
+from kcal import Board, CalibrationOptions, Camera, KcalError, Observations, RigData, calibrate_camera, solve_rig
 from kcal.calibrate import examine
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal.calibrate.camera.trust import against_capture, interval_check, simulated_capture, simulated_refits
 from kcal.lens import rotation_from_vector
 from kcal.lens.pose import Pose, rotation_between
-from kcal.lens.uncertainty import image_sigma
+from kcal.lens.uncertainty import image_sigma, pixel_covariance, pixel_errors
 from kcal.report import camera_verdict, rig_verdict
+from kcal.report.judge_camera import fault_of_views
 from kcal.report.verdict import Requirement, Verdict
 from kcal.rig import pair_by_name, paired_boards
 from kcal.sim.captures import PoseOptions, TrueRig, drawn_lens, drawn_rig, sample_board_poses
 from kcal.sim.truth import TruthLens
-from scripts.shared.captures import sample_pair_poses
-from scripts.shared.page import Lines
-from scripts.shared.prescriptions import PRESCRIPTIONS
-from scripts.shared.sections import NOT_KEPT, Kept, Record, section
-from scripts.shared.traced import as_observations, printed
+from scripts.shared.captures import PRESCRIPTIONS, as_observations, error_at_infinity, printed, sample_pair_poses
+from scripts.shared.page import NOT_KEPT, Kept, Lines, Record, section, table, timed
+from scripts.shared.simulated import figures, simulated
 
 FAULTS = ("model", "fronto-parallel", "warp", "blur", "unsynchronized", "pupil", "mirrored or mixed")
 BOARD = Board(columns=9, rows=6, square=0.04)
@@ -333,3 +351,136 @@ def verdicts(kept: Kept = NOT_KEPT, planted: int = 200, clean: int = 100, first:
     good = [line for line in fine if not broken(line, 1.0)]
     refused = sum(not line["yes"] for line in good)
     yield f"Of the {len(good)} clean captures that are not off by more than required, {refused} got a no."
+
+
+SIGMA, VIEWS, LENSES = 0.08, (5, 8, 12, 20), ("hybrid", "opencv5")
+AT = [math.inf]
+HALF = 0.5
+
+
+def judged_intervals(model: str, seed: int, refits: int) -> Record:
+    """One calibration, its truth, and the verdicts on it."""
+    views, by_hand = VIEWS[seed // 2 % len(VIEWS)], bool(seed % 2)
+    case, second = (simulated(seed, views, SIGMA, by_hand, take=take) for take in (0, 1))
+    options = CalibrationOptions(model=model)
+    try:
+        result = calibrate_camera(case.seen, options)
+        error = error_at_infinity(result.camera, case.lens)
+        truth = figures(result.camera, case.seen, error.pixels, error.errors)
+        check, spent = timed(lambda: interval_check(result, AT, simulated_refits(result, options, AT, range(refits))))
+        fault = fault_of_views(result, options)
+        found = against_capture(result, second.seen, options, AT)[0]
+    except KcalError as refusal:
+        return {"refused": str(refusal)}
+    return {
+        "views": views,
+        "truth": truth["everywhere"],
+        "share": check.shares[0][0],
+        "factor": check.factors[0],
+        "true": check.true,
+        "fault": None if fault is None else fault.text,
+        "same": found.same,
+        "probability": found.probability,
+        "cpu_s": spent,
+    }
+
+
+def interval_lines(records: list[Record]) -> Lines:
+    """One row for each lens model."""
+    yield [
+        "lens", "calibrations", "truly true", "truth inside, of the image", "refits inside", "refits say true",
+        "views say true", "second capture says true", "check agrees", "check with --against agrees",
+        "CPU s, 100 refits",
+    ]  # fmt: skip
+    for model in LENSES:
+        some = [one for one in records if one["key"][0] == model and "refused" not in one]
+        if not some:
+            continue
+        true = [one["truth"] > HALF for one in some]
+        alone = [one["true"] and one["fault"] is None for one in some]
+        both = [ok and one["same"] for ok, one in zip(alone, some, strict=True)]
+        agree = [sum(a == b for a, b in zip(said, true, strict=True)) for said in (alone, both)]
+        yield [
+            "default" if model == LENSES[0] else model,
+            len(some),
+            sum(true),
+            f"{100 * statistics.fmean(one['truth'] for one in some):.0f} %",
+            f"{100 * statistics.fmean(one['share'] for one in some):.1f} %",
+            sum(one["true"] for one in some),
+            sum(one["fault"] is None for one in some),
+            sum(bool(one["same"]) for one in some),
+            f"{agree[0]} of {len(some)}",
+            f"{agree[1]} of {len(some)}",
+            f"{statistics.median(one['cpu_s'] / one['key'][2] for one in some) * 100:.0f}",
+        ]  # fmt: skip
+
+
+@section("ordinary.md", "warm refits", count=1, seeds=range(1))
+def cold_and_warm(count: int = 8, seeds: range = range(4)) -> Lines:
+    """How far refits that begin at the found camera end from those that begin with nothing."""
+    yield ["capture", "refits", "apart, σ (median)", "(largest)", "CPU s warm", "CPU s cold"]
+    options = CalibrationOptions()
+    for seed in [(0, 1, 5, 6)[i] for i in seeds]:
+        views, by_hand = VIEWS[seed // 2 % len(VIEWS)], bool(seed % 2)
+        result = calibrate_camera(simulated(seed, views, SIGMA, by_hand).seen, options)
+        places = result.camera.grid(25, 17).reshape(-1, 2)
+        sigma = pixel_covariance(result.camera, places).diagonal(dim1=-2, dim2=-1).sum(-1)
+        apart, took = [], np.zeros(2)
+        for number in range(count):
+            drawn = simulated_capture(result, options, number)
+            cameras, spent = zip(*(timed(drawn.calibrated, options, warm=warm) for warm in (True, False)), strict=True)
+            took += spent
+            apart.append(
+                float((pixel_errors(cameras[0], cameras[1], places).square().sum(-1) / sigma).nanmean().sqrt())
+            )
+        kind = f"{views} views {'by hand' if by_hand else 'on a stand'}"
+        yield [kind, count, f"{statistics.median(apart):.3f}", f"{max(apart):.3f}",
+               *(f"{each / count:.2f}" for each in took)]  # fmt: skip
+
+
+@section("ordinary.md", "intervals", seeds=range(1), refits=2)
+def intervals(kept: Kept = NOT_KEPT, seeds: range = range(20), refits: int = 100) -> Lines:
+    return interval_lines(kept.records(itertools.product(LENSES, seeds, [refits]), judged_intervals))
+
+
+SAID = "pixels are not square"
+FEWEST_AND_MOST, NOISES, UPRIGHT, ROLLED = (8, 20), (0.05, 0.2), math.radians(2.0), math.radians(90.0)
+
+
+def judged_aspect(stretch: float, seed: int) -> Record:
+    """One capture: what it was, and what was said."""
+    draw = torch.rand(2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed + 40_000)).tolist()
+    views = FEWEST_AND_MOST[0] + int(draw[0] * (FEWEST_AND_MOST[1] - FEWEST_AND_MOST[0] + 1))
+    sigma = NOISES[0] * (NOISES[1] / NOISES[0]) ** draw[1]
+    # Lenses and what is held go round with 3 and 6; 2 and 8 mix all with all.
+    upright, by_hand = seed % 2 == 0, seed // 2 % 4 == 0
+    factor = stretch if seed // 8 % 2 == 0 else 1.0 / stretch
+    case = simulated(seed, views, sigma, by_hand, max_roll=UPRIGHT if upright else ROLLED, stretch=factor)
+    record: Record = {"views": views, "sigma": sigma, "upright": upright, "hand": by_hand, "factor": factor}
+    try:
+        result, spent = timed(calibrate_camera, case.seen)
+    except KcalError as refusal:
+        return record | {"refused": str(refusal)}
+    focal = result.camera.focal.tolist()
+    said = [text for text in result.warnings if SAID in text]
+    return record | {"said": said, "aspect": focal[1] / focal[0], "cpu_s": spent}
+
+
+def aspect_lines(records: list[Record]) -> Iterator[str]:
+    """A row for each stretch and kind of capture."""
+    rows = []
+    for stretch in sorted({record["key"][0] for record in records}):
+        own = [record for record in records if record["key"][0] == stretch]
+        kinds = {"by hand": [r for r in own if r["hand"]], "on a stand": [r for r in own if not r["hand"]]}
+        for name, part in kinds.items():
+            known = [record for record in part if "refused" not in record]
+            said = [record for record in known if record["said"]]
+            off = [abs(record["aspect"] / record["factor"] - 1.0) for record in said]
+            share = f"{100 * len(said) / len(known):.1f} %" if known else "–"
+            rows.append([f"{stretch:g}", name, len(part), len(said), share, f"{max(off):.4f}" if off else "–"])
+    return table(["stretch", "captures", "number", "said not to be square", "share", "largest error of f_y/f_x"], rows)
+
+
+@section("ordinary.md", "aspect", seeds=range(1))
+def of_pixels(kept: Kept = NOT_KEPT, seeds: range = range(1000), stretch: float = 1.0) -> Lines:
+    return aspect_lines(kept.records([(stretch, seed) for seed in seeds], judged_aspect))

@@ -11,7 +11,6 @@ three days before those that count.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -23,8 +22,7 @@ from kcal.rig import Mounting, RigCovariance, planned_rig
 from kcal.watch.history import AngleSeries, Look, TurnModel, between_rows, first_state, learned, passed, taken, turns_of
 from kcal.watch.turned import drift_of_turns
 from kcal.watch.watcher import LIMIT, exceeded
-from scripts.shared.page import Lines, table
-from scripts.shared.sections import section
+from scripts.shared.page import Lines, section, table
 
 RIG = planned_rig()
 ROWS = between_rows(RIG)
@@ -240,9 +238,8 @@ def day_and_night(
 
 
 @torch.no_grad()
-def drifts(chains: int, every: float, model: TurnModel) -> list[list[object]]:
+def drifts(chains: int, every: float, model: TurnModel) -> Lines:
     """How soon a drift of the relative yaw is found, by day."""
-    rows: list[list[object]] = []
     for words, ramp_s in (("at once", 1.0), ("in 10 minutes", 600.0)):
         true = truth(chains, LEARN + 0.4, every, 1)
         skip = int(LEARN * DAY / every)
@@ -258,9 +255,8 @@ def drifts(chains: int, every: float, model: TurnModel) -> list[list[object]]:
         at = torch.where(ever.any(0), since.gather(0, ever.argmax(0)[None])[0], math.inf)
         seen = (true.seen[: skip // 4] > 0) & (since >= 0) & (since <= 600.0)
         by = (at[seen.sum(0) >= 3] <= 600.0 + (ramp_s if ramp_s > 1 else 0.0)).double()
-        rows.append([words, len(by), f"{100 * float(by.mean()):.1f} %", f"{float(at.median()) / 60:.0f} min",
-                     f"{100 * float((at <= 3600.0).double().mean()):.1f} %"])  # fmt: skip
-    return rows
+        yield [words, len(by), f"{100 * float(by.mean()):.1f} %", f"{float(at.median()) / 60:.0f} min",
+               f"{100 * float((at <= 3600.0).double().mean()):.1f} %"]  # fmt: skip
 
 
 @section("watch.md", "swing", chains=5, days=0.1, every=1200.0, targets=10)
@@ -274,7 +270,7 @@ def swing(chains: int = 200, days: float = 5.0, every: float = 120.0, targets: i
 
 
 @section("watch.md", "drift", chains=5, every=1200.0)
-def drift(chains: int = 200, every: float = 120.0) -> Iterator[str]:
+def drift(chains: int = 200, every: float = 120.0) -> Lines:
     """The model is that of a mild swing without temperatures."""
     model = day_and_night(chains, 0.1, every, 1, MILD, heat=False)[1]
     heads = ["drift of 0.01°", "rigs", "found in 10 minutes of its end", "median", "in an hour"]

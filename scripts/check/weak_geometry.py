@@ -21,9 +21,7 @@ from kcal.finding import sentences
 from kcal.locate import enu_from_cam
 from kcal.rig import RigCovariance
 from scripts.shared.long_range import ORIGIN, RANGES, landmarks_of, rig, with_noise
-from scripts.shared.page import Lines
-from scripts.shared.sections import NOT_KEPT, Kept, Record, section
-from scripts.shared.timing import share
+from scripts.shared.page import NOT_KEPT, Kept, Lines, Record, section, share
 
 # How many sets of each kind.
 KINDS = {"random": 200, "row": 50, "plane": 50, "cluster": 50, "two groups": 50, "row at 1 km": 56, "graded": 200}

@@ -27,16 +27,16 @@ from kcal.calibrate.hybrid.measured_board import MeasuredBoard, load_measured_bo
 from kcal.cli.main import main as command_line
 from kcal.corners.board import Board
 from kcal.corners.images import read_gray
-from kcal.corners.observations import Observations, View
 from kcal.errors import KcalError
 from kcal.files import make_folder
 from kcal.io.lookup_file import load_lookup, save_lookup
 from kcal.io.rig_file import save_rig
-from kcal.lens.baking import bake
+from kcal.lens import bake, rotation_from_vector
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Mounting, Origin, Rig
 from scripts.fuzz.damage import damage_bytes, damage_json, damage_table
 from scripts.fuzz.hunt import Prepared
+from scripts.shared.captures import as_observations
 from scripts.shared.small_photographs import photographs
 
 _SECONDS = 30.0  # for one command
@@ -49,17 +49,13 @@ def make_files(folder: Path) -> dict[str, bytes]:
         focal=(300, 301), center=(159.5, 119.5), size=(320, 240), coefficients=[-0.1, 0.02, 0.0, 0.0], model="opencv4"
     )
     generator = torch.Generator().manual_seed(1)
-    views = []
-    for number in range(6):
-        turn = 0.4 * torch.randn(3, generator=generator, dtype=torch.float64)
-        skew = torch.zeros(3, 3, dtype=torch.float64)
-        skew[0, 1], skew[0, 2], skew[1, 2] = -turn[2], turn[1], -turn[0]
-        points = BOARD.points - BOARD.points.mean(0)
-        seen = points @ torch.linalg.matrix_exp(skew - skew.T).T + torch.tensor([0.0, 0.0, 0.25])
-        pixels, _ = camera.project(seen)
-        pixels = pixels + 0.05 * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
-        views.append(View(name=f"{number}.png", pixels=tuple(map(tuple, pixels.tolist()))))
-    observations = Observations(board=BOARD, image_size=(320, 240), views=tuple(views))
+    views, points = [], BOARD.points - BOARD.points.mean(0)
+    for _ in range(6):
+        turn = rotation_from_vector(0.4 * torch.randn(3, generator=generator, dtype=torch.float64))
+        pixels, _ = camera.project(points @ turn.T + torch.tensor([0.0, 0.0, 0.25]))
+        views.append(pixels + 0.05 * torch.randn(pixels.shape, generator=generator, dtype=torch.float64))
+    names = [f"{number}.png" for number in range(6)]
+    observations = as_observations(torch.stack(views), (320, 240), BOARD, names=names)
     observations.save(folder / "obs.json")
     calibrate_camera(observations, CalibrationOptions(model="opencv4")).file(name="left").save(folder / "camera.json")
     rig = Rig.pair(camera, camera, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))

@@ -13,8 +13,7 @@ from hypothesis import strategies
 from pydantic import BaseModel
 from torch import Tensor, nn
 
-from kcal import Camera, Localizer, PositionStatus, Rig
-from kcal.errors import InputError, KcalError
+from kcal import Camera, InputError, KcalError, Localizer, PositionStatus, Rig
 from scripts.fuzz.damage import damaged
 from scripts.fuzz.hunt import Prepared
 from scripts.shared.page import DOCS

@@ -24,7 +24,6 @@ from kcal import (
     Observations,
     Origin,
     Rig,
-    View,
     load_camera,
     load_rig,
     locate_points,
@@ -58,6 +57,7 @@ from kcal.stars.detect import read_night
 from kcal.track import AssociationOptions, Detections
 from scripts.check.device_files import files
 from scripts.fuzz.reader import PROMISED, Reader, whole_text
+from scripts.shared.captures import as_observations
 
 BOARD = Board(columns=3, rows=2, square=0.1)
 CAMERA = Camera.build(focal=(300, 301), center=(159.5, 119.5), size=(320, 240), coefficients=[-0.1, 0.02, 0, 0, 0])
@@ -190,8 +190,7 @@ RIG = Rig.pair(CAMERA, CAMERA, torch.eye(3), torch.tensor([-2.0, 0.0, 0.0]))
 
 
 def _observations(path: Path) -> None:
-    views = [View(name=f"{k}.png", pixels=tuple(map(tuple, view.tolist()))) for k, view in enumerate(board_points())]
-    Observations(board=BOARD, image_size=(320, 240), views=tuple(views)).save(path)
+    as_observations(torch.from_numpy(board_points()), (320, 240), BOARD, names=["0.png", "1.png"]).save(path)
 
 
 def _video(path: Path) -> None:

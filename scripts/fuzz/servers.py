@@ -155,6 +155,13 @@ def require_json(body: bytes) -> Any:
     return json.loads(body, parse_constant=refuse, parse_float=number)
 
 
+def _check_all(app: Starlette, loop: asyncio.AbstractEventLoop, case: bytes) -> None:
+    """Answers to requests, after which the state is still told."""
+    for request in [*json.loads(case), _good("/api/state")]:
+        _check_answer(answer := ask(app, loop, request), request)
+    assert answer.status == 200, "no state any more"
+
+
 def _good(path: str) -> dict[str, Any]:
     headers = {"host": _HOST, "x-kcal-token": _TOKEN}
     return {"method": "GET", "path": path, "query": "", "headers": headers, "body": ""}
@@ -178,9 +185,7 @@ def marking(folder: Path) -> Prepared:
             place.mkdir()
             with contextlib.closing(Desk(pictures, Session(place / "marks.csv"))) as desk:
                 app = marking_app(desk, _TOKEN, (_HOST,))
-                for request in json.loads(case):
-                    _check_answer(ask(app, loop, request), request)
-                assert ask(app, loop, _good("/api/state")).status == 200, "no state any more"
+                _check_all(app, loop, case)
                 shutil.copytree(place, Path(name, "again"), ignore=shutil.ignore_patterns("*.lock"))
                 before = desk.session.state
             files = sorted(path.name for path in place.iterdir())
@@ -201,9 +206,7 @@ def capture(folder: Path) -> Prepared:
     app = capture_app(session, threading.Event(), _TOKEN, (_HOST,))
 
     def check(case: bytes) -> None:
-        for request in json.loads(case):
-            _check_answer(ask(app, loop, request), request)
-        assert ask(app, loop, _good("/api/state")).status == 200, "no state any more"
+        _check_all(app, loop, case)
 
     return Prepared(_requests(), check)
 

@@ -12,20 +12,17 @@ from __future__ import annotations
 
 import functools
 import statistics
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from kcal import Camera, KcalError, Observations
-from kcal.calibrate.camera.calibrate import CalibrationOptions, calibrate_camera
+from kcal import CalibrationOptions, Camera, KcalError, Observations, calibrate_camera
 from kcal.lens import camera_difference
-from scripts.paper.site import KINDS, observe, paper_scene
+from scripts.paper.locate import KINDS, observe, paper_scene
 from scripts.paper.train_eq12 import by_least_squares
+from scripts.shared.captures import error_at_infinity
 from scripts.shared.held_out import of_halves
-from scripts.shared.infinity import error_at_infinity
-from scripts.shared.page import table
+from scripts.shared.page import NOT_KEPT, Kept, Record, section, table, timed
 from scripts.shared.real_captures import load, names
-from scripts.shared.sections import NOT_KEPT, Kept, Record, section
 
 SITE, VIEWS = "site ", 30
 RESIDUAL = "ext20 + Eq. 11"
@@ -63,12 +60,10 @@ def observed(capture: str, work: Path, views: int = VIEWS) -> Observations:
 def measured(capture: str, lens: str, work: Path, views: int = VIEWS) -> Record:
     """One lens on one capture."""
     seen, record = observed(capture, work, views), Record()
-    start = time.process_time()
     try:
-        camera, record["rms"] = fitted(seen, lens)
+        (camera, record["rms"]), record["cpu_s"] = timed(fitted, seen, lens)
     except KcalError as error:
         return record | {"refused": str(error)}
-    record["cpu_s"] = time.process_time() - start
     if capture.startswith(SITE):
         truth = paper_scene(KINDS[capture.removeprefix(SITE)], 0).rig.left
         record["infinity"] = error_at_infinity(camera, truth).rms

@@ -8,11 +8,7 @@ out are other views, whose poses alone are solved. The last rows train the inver
 
 from __future__ import annotations
 
-import functools
 import math
-import time
-from collections.abc import Callable, Iterator
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -23,10 +19,9 @@ from kcal.calibrate.camera.trust import seen_pixels
 from kcal.lens.camera import Camera
 from kcal.nets.inverse import InverseFit, InverseNetOptions, train_inverse
 from kcal.nets.joint import JointFit, JointOptions, train_jointly
-from scripts.shared.page import table
-from scripts.shared.sections import section
+from scripts.shared.page import Lines, section, table, timed
+from scripts.shared.real_captures import held_out, warped
 from scripts.shared.views import observed, simulate
-from scripts.shared.wide_lens import held_out, warped
 
 MODEL = "ext20"
 RATES, TRIAL = [10.0**e for e in range(-6, 0)], 0.1
@@ -34,7 +29,6 @@ HEADS = [
     "trained", "loss, px²", "corners, RMS px", "held out, RMS px", "inverse at the corners, RMS px",
     "over the image, RMS px", "largest, px", "CPU s",
 ]  # fmt: skip
-T = TypeVar("T")
 
 
 def points_of(result: CameraCalibrationResult) -> Tensor:
@@ -60,16 +54,10 @@ def by_least_squares(result: CameraCalibrationResult, steps: int | None = None) 
     return train_jointly(result.camera, points_of(result), seen_pixels(result), JointOptions(steps=steps))
 
 
-def timed(call: Callable[[], T]) -> tuple[T, str]:
-    start = time.process_time()
-    return call(), f"{time.process_time() - start:.1f}"
-
-
 def rows(steps: int, views: int, hidden: tuple[int, int] = (8, 12)) -> list[list[str]]:
     """The table without its heads."""
-    result, seconds = timed(
-        lambda: calibrate_camera(observed(simulate(views)["pixels"].tolist()), CalibrationOptions(model=MODEL))
-    )
+    seen = observed(simulate(views)["pixels"].tolist())
+    result, seconds = timed(calibrate_camera, seen, CalibrationOptions(model=MODEL))
     others = observed(simulate(views, seed=1000)["pixels"].tolist())
     weight = torch.ones_like(others.pixels()[..., 0])
 
@@ -80,21 +68,21 @@ def rows(steps: int, views: int, hidden: tuple[int, int] = (8, 12)) -> list[list
     def inverse(fit: InverseFit) -> list[str]:
         return [f"{fit.rms:.4f}", f"{fit.largest:.4f}"]
 
-    found = [["calibration, no net", "", f"{result.rms:.4f}", outside(result.camera), "", "", "", seconds]]
+    found = [["calibration, no net", "", f"{result.rms:.4f}", outside(result.camera), "", "", "", f"{seconds:.1f}"]]
     joint = {
-        "Eq. 12 by Adam": timed(lambda: by_adam(result, steps, hidden)),
-        "Eq. 12 by Levenberg-Marquardt": timed(lambda: by_least_squares(result, min(steps, 100))),
+        "Eq. 12 by Adam": timed(by_adam, result, steps, hidden),
+        "Eq. 12 by Levenberg-Marquardt": timed(by_least_squares, result, min(steps, 100)),
     }
     for name, (fit, seconds) in joint.items():
         cells = [f"{float(fit.losses[-1]):.6f}", f"{fit.rms:.4f}", outside(fit.camera), f"{fit.inverse_rms:.4f}"]
-        found.append([name, *cells, *inverse(fit.inverse), seconds])
+        found.append([name, *cells, *inverse(fit.inverse), f"{seconds:.1f}"])
     for name, radial in (("inverse alone, as in the paper", False), ("inverse alone, after the closed form", True)):
         options = InverseNetOptions(hidden=hidden[1], radial=radial)
-        alone, seconds = timed(functools.partial(train_inverse, result.camera, options))
-        found.append([name, "", "", "", "", *inverse(alone), seconds])
+        alone, seconds = timed(train_inverse, result.camera, options)
+        found.append([name, "", "", "", "", *inverse(alone), f"{seconds:.1f}"])
     return found
 
 
 @section("paper.md", "eq 12", steps=2, views=4)
-def eq_12(steps: int = 2000, views: int = 30) -> Iterator[str]:
+def eq_12(steps: int = 2000, views: int = 30) -> Lines:
     return table(HEADS, rows(steps, views))

@@ -7,16 +7,20 @@ libraries are held to one thread there.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import multiprocessing
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext
+from pathlib import Path
 from typing import Any
 from unittest import mock
+
+from scripts.shared.page import children_seconds
 
 ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 # Interpreters of other programs that were asked for; a page's comment tells what they have.
@@ -55,6 +59,26 @@ def or_failure(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 def answer(*command: object, timeout: float | None = None) -> dict[str, Any]:
     """The same as `answered`; or {"failed": why}."""
     return or_failure(lambda: answered(*command, timeout=timeout))
+
+
+def timed_process(*command: object, **options: Any) -> tuple[subprocess.CompletedProcess[str], float]:
+    """A process that has ended, and CPU seconds, those of what it started included."""
+    before = children_seconds()
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, **options)
+    return done, children_seconds() - before
+
+
+@contextlib.contextmanager
+def marking_server(folder: Path, *words: str, **options: Any) -> Iterator[tuple[str, int]]:
+    """`kcal mark` of left.png and right.png in a folder: the address of its page, and the number of its process."""
+    command = [sys.executable, "-m", "kcal", "mark", "left.png", "right.png", *words, "--port", "0", "--no-browser"]
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder, **options)
+    try:
+        assert server.stdout is not None
+        yield server.stdout.readline().split()[-1], server.pid
+    finally:
+        server.kill()
+        server.wait()
 
 
 def children(*imported: str) -> ForkServerContext:

@@ -15,11 +15,10 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from scipy.interpolate import NdBSpline
 from torch import Tensor
 
-from kcal import Camera
-from kcal.corners.board import Board
-from kcal.corners.observations import Observations
+from kcal import Board, Camera, Observations
 from scripts.shared.children import answered, interpreter
 from scripts.shared.held_out import held_out
 
@@ -160,25 +159,15 @@ class SplinedCamera:
 
     def __init__(self, found: dict[str, Any], size: tuple[int, int], knots: tuple[int, int] = KNOTS) -> None:
         values = torch.tensor(found["intrinsics"], dtype=torch.float64)
-        self.size, self._knots = size, knots
+        self.size = size
         self._focal, self._center = values[:2], values[2:4]
-        self._control = values[4:].reshape(knots[1], knots[0], 2)
-        self._spacing = float(found["knots"][1] - found["knots"][0])
+        spacing = float(found["knots"][1] - found["knots"][0])
+        knots_of = (spacing * (np.arange(count + 4) - 0.5 * (count + 3)) for count in knots)
+        self._spline = NdBSpline(tuple(knots_of), values[4:].reshape(*knots[::-1], 2).movedim(1, 0).numpy(), 3)
 
     def _shift(self, u: Tensor) -> Tensor:
         """Δu (N, 2) at u (N, 2)."""
-        total = torch.zeros_like(u)
-        cells, weights = [], []
-        for axis, count in enumerate(self._knots):
-            place = u[:, axis] / self._spacing + 0.5 * (count - 1)
-            cell = place.floor().clamp(1, count - 3)
-            cells.append(cell.long())
-            weights.append(_cubic(place - cell))
-        for i in range(4):
-            for j in range(4):
-                control = self._control[cells[1] + i - 1, cells[0] + j - 1]
-                total += (weights[1][i] * weights[0][j])[:, None] * control
-        return total
+        return torch.from_numpy(self._spline(u.numpy()))
 
     def project(self, points_cam: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels (..., N, 2), and valid (..., N): not straight behind."""
@@ -199,11 +188,6 @@ class SplinedCamera:
         rays = torch.cat([u, 1.0 - quarter], -1) / (1.0 + quarter)
         valid = ((u + self._shift(u) - target).norm(dim=-1) * self._focal[0] < 0.1) & rays.isfinite().all(-1)
         return rays.reshape(*pixels.shape[:-1], 3), valid.reshape(pixels.shape[:-1])
-
-
-def _cubic(x: Tensor) -> tuple[Tensor, ...]:
-    """Weights of the four control points of a uniform cubic B-spline, x in the second of three cells."""
-    return (1 - x) ** 3 / 6, (3 * x**3 - 6 * x**2 + 4) / 6, (-3 * x**3 + 3 * x**2 + 3 * x + 1) / 6, x**3 / 6
 
 
 def splined_camera(seen: Observations, weight: Tensor) -> SplinedCamera:

@@ -45,6 +45,7 @@ _HILLS = ((20_000.0, 520.0), (11_000.0, 200.0), (6_000.0, 70.0), (3_200.0, 18.0)
 _HEADING, _LATITUDE, _DECLINATION = 40.0, 47.0, 10.0
 # Of light at noon on the level: what comes from the sky, and of the sun's what a shadow lets through.
 _FROM_SKY = 0.3
+_HIGHEST = math.sin(math.radians(90.0 - _LATITUDE + _DECLINATION))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,18 +227,16 @@ def _about_upright(angle: Tensor) -> Tensor:
 
 def _brightness(weather: Weather) -> float:
     """Of the level ground, beside that at noon; after sunset a tenth of the sky's light is left half an hour later."""
-    highest = math.sin(math.radians(90.0 - _LATITUDE + _DECLINATION))
     height = float(weather.sun[2])
     sky = _FROM_SKY * min(1.0, 10.0 ** (height / 0.1)) if height < 0 else _FROM_SKY
-    return sky + (1.0 - _FROM_SKY) * max(height, 0.0) / highest
+    return sky + (1.0 - _FROM_SKY) * max(height, 0.0) / _HIGHEST
 
 
 def _lit(normal: Floats, weather: Weather) -> float:
     """Light on a face, beside that on the level ground at noon."""
-    highest = math.sin(math.radians(90.0 - _LATITUDE + _DECLINATION))
     direct = max(float(normal @ weather.sun), 0.0) if weather.sun[2] > 0 else 0.0
-    sky = _brightness(weather) - (1.0 - _FROM_SKY) * max(float(weather.sun[2]), 0.0) / highest
-    return sky + (1.0 - _FROM_SKY) * direct / highest
+    sky = _brightness(weather) - (1.0 - _FROM_SKY) * max(float(weather.sun[2]), 0.0) / _HIGHEST
+    return sky + (1.0 - _FROM_SKY) * direct / _HIGHEST
 
 
 def _patterned(

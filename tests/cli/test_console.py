@@ -30,7 +30,7 @@ from kcal.cli.main import app, main, usage_errors_shown
 from kcal.cli.options import SETTINGS, defaults_of, read_settings, toml_text
 from kcal.files import read_bytes, replaced, write_atomic, written_files
 from kcal.texts import visible
-from scripts.bench.startup import helps, measure, on_terminal
+from scripts.bench.hybrid_time import helps, measure, on_terminal
 
 # What reaches the terminal is shown and does nothing else; errors are one line.
 

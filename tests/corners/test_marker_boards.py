@@ -13,8 +13,8 @@ from kcal.corners.marker_boards import _opencv_board, find_aprilgrid, find_charu
 from kcal.corners.markers import marker_cells, opencv_dictionary
 from kcal.corners.print_board import pattern_shapes
 from kcal.corners.search import NotFoundError
+from scripts.bench.found import WRONG
 from scripts.bench.hard_boards import Marked, covered, cut, moving, noisy, pictures, plain, small
-from scripts.bench.marked_boards import WRONG
 from scripts.shared.printed_board import Paper, add, errors, expose, light_of, points_of, pose
 
 CAMERA = Camera.build(focal=(430, 430), center=(243, 177), size=(480, 360), coefficients=[-0.1, 0.02])

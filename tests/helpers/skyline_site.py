@@ -11,7 +11,7 @@ from kcal import Camera, Origin
 from kcal.locate import enu_from_cam
 from kcal.locate.ground import Raster
 from kcal.rig import RasterError
-from scripts.shared.skyline_scenes import Hills, HillWeather, level_system, raster_around, skyline_image
+from scripts.check.skyline import Hills, HillWeather, level_system, raster_around, skyline_image
 
 HILLS = Hills(seed=3, relief=260.0, clear=700.0, far=4_500.0)
 ANGLES = (40.0, 3.0, 1.0)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcal.lens.camera import Camera
 from kcal.lens.rig import Mounting, Origin, Rig
-from scripts.shared.object_scene import Plate, exposed, paint_plate, plate
+from scripts.shared.marking_scene import Plate, exposed, paint_plate, plate
 
 SIZE = (320, 240)
 START = torch.tensor([[-6.0, 1.0, 40.0], [5.0, -3.0, 60.0]]).double()

@@ -17,9 +17,8 @@ from kcal.io.camera_file import camera_to_file, load_camera, save_camera
 from kcal.lens import LensModel
 from kcal.lens.model import PORT
 from kcal.lens.projection import project_components
-from scripts.check.ports import seen_by
-from scripts.shared.infinity import error_at_infinity
-from scripts.shared.port import WATER, PortedCamera
+from scripts.check.ports import WATER, PortedCamera, seen_by
+from scripts.shared.captures import error_at_infinity
 
 POINTS = torch.tensor([[0.3, 0.2, 1.2], [-0.4, 0.1, 0.9], [0.0, 0.0, 1.0], [0.06, -0.04, 1.0]], dtype=torch.float64)
 AXIS = (0.06, -0.04)

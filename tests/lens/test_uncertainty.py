@@ -11,7 +11,7 @@ from kcal import Camera, InputError
 from kcal.lens import CameraCalibration, camera_difference, rotation_from_vector
 from kcal.lens.information import CameraInformation
 from kcal.lens.uncertainty import image_sigma, pixel_covariance, projection_sigma
-from scripts.shared.infinity import error_at_infinity
+from scripts.shared.captures import error_at_infinity
 
 # Uncertainty of points at infinity: what a change of a parameter does to the image after the best-fit rotation.
 

@@ -1,16 +1,16 @@
-"""The inverse over whole valid regions and images of many random lenses: a small run of `scripts/check/inverse.py`."""
+"""The inverse over whole valid regions and images of many random lenses: a small run of `scripts/check/folds.py`."""
 
 import pytest
 import torch
 
 from kcal.lens.inverse import undistort
-from scripts.check import inverse
+from scripts.check import folds
 from scripts.shared.distorted import distort
 
 
 @pytest.mark.slow
 def test_random_lenses() -> None:
-    tally = inverse.sweep(lenses=320, seed=1, points=100)
+    tally = folds.sweep(lenses=320, seed=1, points=100)
     assert tally.points > 20_000
     assert tally.valid > 15_000
     assert (tally.lost, tally.elsewhere, tally.wrong) == (0, 0, 0)

@@ -13,8 +13,7 @@ from kcal.corners import MatchStatus, patches
 from kcal.lens import rotation_from_vector
 from kcal.locate.stereo import flag_positions
 from kcal.pipeline.pairing import DisparityOptions, ObjectDisparities, ObjectDisparity, _brightest, _Objects
-from scripts.shared.marking_scene import background
-from scripts.shared.object_scene import exposed, paint_plate, plate, texture_gradient, true_box
+from scripts.shared.marking_scene import background, exposed, paint_plate, plate, texture_gradient, true_box
 
 # Rendered objects before a rig, with boxes that err, for tests of matching.
 

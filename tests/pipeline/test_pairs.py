@@ -13,7 +13,7 @@ from kcal.errors import InputError
 from kcal.pipeline.pairing import ObjectViews, matched_pixels
 from kcal.rig import planned_rig
 from kcal.track import AssociationOptions, Detections, pair_objects
-from scripts.shared.object_scene import exposed, paint_plate, plate, true_box
+from scripts.shared.marking_scene import exposed, paint_plate, plate, true_box
 
 
 def pairs(**changes: object) -> ObjectViews:

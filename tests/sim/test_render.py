@@ -26,7 +26,7 @@ from kcal.sim.raytrace import SURVEILLANCE
 from kcal.sim.scene import RenderOptions, invert_window, render_board, render_light
 from kcal.sim.truth import PixelRectangle, TruthLens, pixel_axes
 from scripts.shared.captures import PAPER_BOARD
-from scripts.shared.moving_captures import HandMotion, Hands, draw_motion, moving_capture, noise_root, rolling_corners
+from scripts.shared.simulated import HandMotion, Hands, draw_motion, moving_capture, noise_root, rolling_corners
 
 BOARD = BoardSize(9, 6, 0.06)
 

@@ -22,9 +22,15 @@ from kcal.sim.raytrace import (
     trace,
 )
 from kcal.sim.truth import TruthLens
-from scripts.shared.captures import PAPER_BOARD, capture_corners
-from scripts.shared.infinity import error_at_infinity
-from scripts.shared.prescriptions import MACHINE_VISION, PRESCRIPTIONS, WEBCAM, Asphere
+from scripts.shared.captures import (
+    MACHINE_VISION,
+    PAPER_BOARD,
+    PRESCRIPTIONS,
+    WEBCAM,
+    Asphere,
+    capture_corners,
+    error_at_infinity,
+)
 
 # The true lens: its table is the tracing, its inverse its inverse, and misplaced glass acts where it is.
 

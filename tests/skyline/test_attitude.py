@@ -14,7 +14,7 @@ from kcal.rig import RasterError
 from kcal.skyline import attitude
 from kcal.skyline.attitude import SkylineAttitude, skyline_attitude
 from kcal.skyline.fit import Candidate
-from scripts.shared.skyline_scenes import Hills, HillWeather, skyline_image
+from scripts.check.skyline import Hills, HillWeather, skyline_image
 from tests.helpers.skyline_site import (
     ANGLES,
     CELL,

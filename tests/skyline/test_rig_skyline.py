@@ -18,7 +18,7 @@ from kcal.locate.stations import station_mounting
 from kcal.rig import SkylineImage, skyline_source
 from kcal.skyline import attitude
 from kcal.skyline.horizon import terrain_horizon
-from scripts.shared.skyline_scenes import HillWeather
+from scripts.check.skyline import HillWeather
 from tests.helpers.skyline_site import ANGLES, ERROR, camera, image, small_site
 
 SIGMA = torch.full((2, 3), 0.02).double()

@@ -29,7 +29,7 @@ from kcal.stars.sky import (
     pair_table,
 )
 from kcal.values import instant
-from scripts.shared.night_scenes import PLACE, TIME, night_camera, rendered, star_pixels
+from scripts.check.stars import PLACE, TIME, night_camera, rendered, star_pixels
 
 CATALOG = StarCatalog.bundled()
 CAMERA = night_camera()

@@ -16,7 +16,7 @@ from kcal.io.images import write_png
 from kcal.lens import rotation_from_vector, vector_from_rotation
 from kcal.locate import enu_from_cam
 from kcal.stars.sky import StarCatalog, pole_in_enu
-from scripts.shared.night_scenes import LOOKS, PLACE, TIME, night_camera, rendered, star_pixels, star_rig
+from scripts.check.stars import LOOKS, PLACE, TIME, night_camera, rendered, star_pixels, star_rig
 
 CAMERA = night_camera(1600.0, (1920, 1080))
 STRAIGHT = RigOptions(refraction=0.0, refraction_sigma=0.0)

@@ -55,7 +55,7 @@ from kcal.stars.sky import (
     pole_in_enu,
     unit_vectors,
 )
-from scripts.shared.night_scenes import PLACE, TIME, night_camera, star_pixels
+from scripts.check.stars import PLACE, TIME, night_camera, star_pixels
 
 CATALOG = StarCatalog.bundled()
 CAMERA = night_camera()

@@ -19,10 +19,8 @@ from kcal.stars.detect import DetectedStars
 from kcal.stars.lens import StarCamera, calibrate_by_stars, refine_by_stars
 from kcal.stars.lens_fit import StarField, fit_star_lens
 from kcal.stars.sky import StarCatalog, cache_folder, pair_table
-from scripts.shared.infinity import error_at_infinity
-from scripts.shared.night_scenes import PLACE, SIZE, lens_difference, rendered, star_images, true_lens
-from scripts.shared.prescriptions import PRESCRIPTIONS
-from scripts.shared.traced import capture
+from scripts.check.stars import PLACE, SIZE, lens_difference, rendered, star_images, true_lens
+from scripts.shared.captures import PRESCRIPTIONS, capture, error_at_infinity
 
 # Boards and stars together: one posterior, and whether they contradict each other.
 

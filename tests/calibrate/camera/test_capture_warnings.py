@@ -26,7 +26,7 @@ from kcal.lens.uncertainty import paraxial_focal
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.captures import BoardSize, board_points, sample_board_poses
 from kcal.solve.lm import SolverStatus
-from scripts.shared.moving_captures import Hands, moving_capture
+from scripts.shared.simulated import Hands, moving_capture
 
 BOARD = BoardSize(9, 6, 0.05)
 CAMERA = Camera.build(focal=(1100, 1100), center=(639.5, 479.5), size=(1280, 960), coefficients=[-0.1])

@@ -14,7 +14,7 @@ from kcal.calibrate.camera.calibrate import CalibrationOptions, CameraCalibratio
 from kcal.calibrate.camera.checks import OutlierRejection
 from kcal.calibrate.camera.trust import stored_options, summarize
 from kcal.solve import LMOptions
-from scripts.shared.infinity import error_at_infinity
+from scripts.shared.captures import error_at_infinity
 
 NOISE = 0.1
 

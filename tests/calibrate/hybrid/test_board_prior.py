@@ -20,7 +20,7 @@ from kcal.calibrate.hybrid.families import BOARD, Hyperprior, PriorFamilies, typ
 from kcal.calibrate.hybrid.measured_board import BoardPrior, evidence, printed_board, printed_prior
 from kcal.gaussian import Gaussian, numbered
 from kcal.lens.information import BOARD_SLOT
-from scripts.shared.infinity import error_at_infinity
+from scripts.shared.captures import error_at_infinity
 from scripts.shared.simulated import Simulated, bends, simulated, terms
 
 # Messages about a board: products, evidence and turns are those of dense Gaussians.

@@ -27,8 +27,7 @@ from kcal.lens import LensModel, rotation_from_vector
 from kcal.lens.model import HybridForm
 from kcal.lens.zernike import ZernikeModes
 from kcal.sim.captures import drawn_lens
-from scripts.shared.captures import capture_corners
-from scripts.shared.prescriptions import MACHINE_VISION
+from scripts.shared.captures import MACHINE_VISION, capture_corners
 
 BOARD = Board(columns=9, rows=7, square=0.04)
 SIZE = (1280, 960)

@@ -23,7 +23,7 @@ from kcal.calibrate.hybrid.network_fit import (
     weights_of,
 )
 from kcal.nets import NetworkModes
-from scripts.shared.dented_lens import BOARD, NOISE, SIZE, capture, network, off
+from scripts.bench.network_field import BOARD, NOISE, SIZE, capture, network, off
 
 
 class Rings(nn.Module):

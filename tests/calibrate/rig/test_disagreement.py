@@ -18,8 +18,7 @@ from kcal import Baseline, DegenerateError, InputError, Landmarks, RigData, RigO
 from kcal.calibrate.rig.contradictions import _RATIOS, _field_modes, own_fits
 from kcal.calibrate.rig.result import RigResult
 from kcal.lens import vector_from_rotation
-from scripts.check.contradictions import boards, surveyed
-from scripts.check.rig import STRAIGHT, TRUTH
+from scripts.check.rig import STRAIGHT, TRUTH, boards, surveyed
 
 
 def sigmas(found: RigResult) -> Tensor:

@@ -24,7 +24,7 @@ from kcal.lens.pose import Pose, rotation_from_vector, vector_from_rotation
 from kcal.rig import pair_by_name
 from kcal.sim.captures import BoardSize, sample_board_poses
 from kcal.solve.schur import Products, without_local
-from scripts.shared.moving_captures import Hands, moving_capture
+from scripts.shared.simulated import Hands, moving_capture
 
 F64 = torch.float64
 BOARD, SIZE = Board(columns=9, rows=6, square=0.05), BoardSize(9, 6, 0.05)
