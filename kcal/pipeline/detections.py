@@ -132,7 +132,8 @@ def _from_json(source: str | bytes) -> Raw:
     if not isinstance(line, dict) or "boxes" not in line or not set(line) <= _KEYS:
         raise InputError(f"detections: a JSON object with boxes, and else only {', '.join(sorted(_KEYS))}, is needed")
     size, time = line.get("size"), line.get("time")
-    if size is not None and not (isinstance(size, list) and len(size) == 2 and all(type(v) is int for v in size)):
+    sides = size if isinstance(size, list) else []
+    if size is not None and not (len(sides) == 2 and all(type(side) is int and side > 0 for side in sides)):
         raise InputError(f"detections: size must be [width, height], got {size}")
     if time is not None and type(time) not in (int, float):
         raise InputError(f"detections: time must be seconds, got {time!r}")
@@ -147,7 +148,7 @@ def _from_json(source: str | bytes) -> Raw:
         score=_optional(line.get("scores"), "scores"),
         category=categories,
         track=tracks,
-        keypoints=_optional(line.get("keypoints"), "keypoints"),
+        keypoints=_found_keypoints(line.get("keypoints")),
         size=None if size is None else (size[0], size[1]),
         time=time,
     )

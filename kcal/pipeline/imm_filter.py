@@ -57,14 +57,14 @@ class Motion:
             raise InputError("motion: a finite noise, not negative, a finite rate and a positive memory are needed")
 
 
-# New targets are slow, or aircraft at 150 m/s. What crosses slowly may still come fast: the first sightings tell how it
-# crosses, and much later ones whether it comes.
-STRAIGHT = Motion(acceleration=0.3, fast=(1.0, 10.0))
+# New targets may be aircraft at 150 m/s. How fast they cross shows at once, so that only what turns begins as fast; how
+# fast they come shows late, and no model may rule it out before.
+STRAIGHT = Motion(acceleration=0.3, fast=(1.0, 7.0))
 MOTIONS = (
-    Motion(acceleration=0.3, memory_s=1.0),
+    Motion(acceleration=0.3, memory_s=1.0, fast=(1.0, 7.0)),
     STRAIGHT,
-    Motion(acceleration=2.0, turn_rate=0.2, fast=(10.0, 10.0)),
-    Motion(acceleration=2.0, turn_rate=-0.2, fast=(10.0, 10.0)),
+    Motion(acceleration=2.0, turn_rate=0.2, fast=(7.0, 7.0)),
+    Motion(acceleration=2.0, turn_rate=-0.2, fast=(7.0, 7.0)),
 )
 
 

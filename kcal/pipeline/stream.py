@@ -372,6 +372,8 @@ def _texts(values: torch.Tensor, ok: torch.Tensor) -> list[str]:
 
 # Time steps that wait, and time steps between checkpoints: about ten seconds of video.
 _WAITING, _CHECKPOINT = 32, 250
+# Seconds: no two images of one moment are farther apart.
+_APART = 10.0
 # Bytes; a longer line is malformed, so that memory stays bounded.
 _LONGEST = 1 << 22
 
@@ -558,6 +560,10 @@ class Stream:
         largest = max([abs(moment.time), *moment.pairs.time.abs().flatten().tolist()])
         if largest >= MOST_SECONDS:
             return InputError(f"time {largest:.6g}: seconds are needed; this may be in milliseconds or smaller units")
+        times, seen = moment.pairs.time, moment.pairs.seen
+        latest, first = times.masked_fill(~seen, -math.inf).amax(1), times.masked_fill(~seen, math.inf).amin(1)
+        if len(times) and (apart := float((latest - first).amax())) > _APART:
+            return InputError(f"the cameras' times are {apart:.6g} s apart: do clocks count in one zone, from one day?")
         if self.start is not None:
             try:
                 self.start + datetime.timedelta(seconds=moment.time)

@@ -158,6 +158,18 @@ def test_wrong_times_are_told(folder: Path) -> None:
     assert "last malformed line: time 1e+13: seconds are needed" in told
 
 
+def test_clocks_that_count_from_other_days_are_told(folder: Path) -> None:
+    """In place of "the parallax is below three sigma", and of intervals to infinity."""
+    texts = (folder / "lines.jsonl").read_text().splitlines()[:20]
+    lines = [json.loads(text) for text in texts]
+    for line in lines[:10]:
+        line["time"] = [line["time"], line["time"] + 3600.0]
+    (folder / "lines.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n")
+    told = " ".join(live(folder).split())
+    assert "last malformed line: the cameras' times are 3600 s apart: do clocks count in one zone" in told
+    assert "10 moments, " in told
+
+
 def test_nothing_that_can_be_read_is_an_error(folder: Path) -> None:
     lines = [json.loads(line) for line in (folder / "lines.jsonl").read_text().splitlines()[:20]]
     texts = [json.dumps(line | {"time": 1e3 * line["time"]}) for line in lines]

@@ -226,8 +226,9 @@ def test_messages(folder: Path) -> None:
         run(folder, "rig", *three, "another/mill.camera.json", *given)
     with pytest.raises(FileError, match="a rig of 4 cameras; a rig of two is needed"):
         run(folder, "budget", "rig.json")
-    text = run(folder, "locate", "rig.json", "smoke.csv", "--yaw-sigma", "0.1").replace("│", " ")
-    assert "come from the rig file" in " ".join(text.split())
+    refused = ran("locate", folder / "rig.json", folder / "smoke.csv", "--yaw-sigma", "0.1")
+    assert refused.exit_code == 2
+    assert "come from the rig file" in " ".join(refused.output.replace("│", " ").split())
     (folder / "twice.csv").write_text("name,camera,u,v\na,mill,1,2\na,mill,3,4\n")
     with pytest.raises(FileError, match="line 3: 'a' was marked in mill before"):
         run(folder, "locate", "rig.json", "twice.csv")

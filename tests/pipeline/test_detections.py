@@ -1,5 +1,6 @@
 """Detections and lines of JSON: what a detector returns, what it may be, and how a line is read."""
 
+import json
 import sys
 import types
 from typing import Any
@@ -91,6 +92,7 @@ def test_keypoints_at_the_corner_were_not_found() -> None:
     for source in (
         results(keypoints=types.SimpleNamespace(xy=points[..., :2])),
         {"boxes": EDGES, "keypoints": points},
+        json.dumps({"boxes": torch.as_tensor(EDGES).tolist(), "keypoints": points.tolist()}),
     ):
         found = Detections.read(source, size=SIZE)
         assert found.anchors(1).isnan().all(-1).tolist() == [True, False]
@@ -172,6 +174,7 @@ def test_selection() -> None:
         (lambda: Detections.read('{"boxes": [[1, 2, 3, 4]], "scores": [1, 2]}', size=SIZE), "score"),
         (lambda: Detections.read('{"boxes": [], "time": "now"}', size=SIZE), "time must be seconds"),
         (lambda: Detections.read('{"boxes": [], "size": [3]}', size=SIZE), "size must be"),
+        (lambda: Detections.read('{"boxes": [], "size": [-64, 48]}'), "size must be"),
         (lambda: Detections.read('{"boxes": [], "size": [3, 4]}', size=SIZE), "the source says"),
         (lambda: Detections.read('{"boxes": [], "categories": 3}', size=SIZE), "categories must be"),
         (lambda: Detections.read('{"boxes": [], "tracks": 3}', size=SIZE), "tracks must be"),

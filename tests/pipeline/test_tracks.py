@@ -265,6 +265,29 @@ def test_what_is_told_may_be_differentiated_further() -> None:
     assert torch.equal(copy.deepcopy(tracker).tracks().state.enu, tracks.state.enu)
 
 
+@pytest.mark.parametrize(("course_deg", "speed"), [(90.0, 150.0), (180.0, 150.0), (45.0, 100.0), (180.0, 8.0)])
+def test_aircraft_and_walkers_have_the_errors_that_are_stated(course_deg: float, speed: float) -> None:
+    """By default: what crosses at 150 m/s has a track at once, and what comes so is not held to be slow."""
+    pace = speed * tensor([math.sin(math.radians(course_deg)), 0.0, math.cos(math.radians(course_deg))])[0]
+    inside, moving, told = [], [], 0
+    for seed in range(3):
+        site, generator = tracked_site(), torch.Generator().manual_seed(seed)
+        tracker = Tracker(site)
+        for time in range(40):
+            place = tensor([0.0, -50.0, 2000.0]) + pace * (time - 20) / 10
+            tracks = tracker(pairs_of(*seen_by(site.rig, place, 0.3, generator), time / 10), time / 10)
+            if not tracks.number:
+                continue
+            told += 1
+            state, far = tracks.state, float(torch.linalg.vector_norm(place))
+            inside.append(float(state.range_low[0]) < far < float(state.range_high[0]))
+            off = state.velocity[0] - pace[[0, 2, 1]] * tensor([1.0, 1.0, -1.0])[0]
+            moving.append(float(off @ torch.linalg.solve(state.velocity_covariance[0], off)) < 16.27)
+    assert told >= 3 * 37
+    assert sum(inside) >= 0.9 * len(inside)
+    assert sum(moving) >= 0.97 * len(moving)
+
+
 def test_what_is_seen_once_is_not_told() -> None:
     localize = tracked_site()
     tracker = Tracker(localize)

@@ -419,7 +419,7 @@ async function start() {
   app.take(await get("state"));
   if (!app.selected && app.items.length) app.select((app.items.find((item) => !item.left || !item.right) || app.items[0]).name);
   if (about.notes.length) app.say(about.notes.join("; "), true);
-  else if (app.actions.waiting.length === 0) app.say(about.cameras ? "Choose an item in the list, or press N for a new target; click it in one image. The key ? lists all keys." : "No cameras were given: marks are snapped and saved, but no geometry helps. Start with --rig or --cameras for it.");
+  else if (app.actions.waiting.length === 0 && !byId("status").textContent) app.say(about.cameras ? "Choose an item in the list, or press N for a new target; click it in one image. The key ? lists all keys." : "No cameras were given: marks are snapped and saved, but no geometry helps. Start with --rig or --cameras for it.");
 }
 start().catch((error) => {
   byId("status").textContent = error.message;

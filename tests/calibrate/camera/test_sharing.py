@@ -1,5 +1,6 @@
 """Cameras calibrated together share the board that they saw, and only that."""
 
+import copy
 import dataclasses
 import functools
 from pathlib import Path
@@ -203,7 +204,8 @@ def test_cameras_that_saw_other_boards_are_not_fitted_together(monkeypatch: pyte
     """Nothing is common to them: each stays as it is alone, and no time is spent."""
     never = Mock(side_effect=AssertionError("fitted together"))
     monkeypatch.setattr("kcal.calibrate.camera.calibrate.fit_cameras", never)
-    found = [alone(1), alone(2)]
+    # A result writes what it knows into its camera, also one that is made by `replace`.
+    found = [alone(1), copy.deepcopy(alone(2))]
     other = Board(columns=BOARD.columns, rows=BOARD.rows, square=0.031)
     found[1] = dataclasses.replace(found[1], observations=found[1].observations.model_copy(update={"board": other}))
     assert sharing(found, CalibrationOptions()) == found
