@@ -1,5 +1,7 @@
 """Slips of users get an `InputError` that names them: another type, another order, fields that do not fit."""
 
+from __future__ import annotations  # slips are named where annotations are text, as in kcal
+
 import pickle
 import warnings
 from collections.abc import Callable

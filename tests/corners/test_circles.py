@@ -35,7 +35,7 @@ def test_centers_of_tilted_boards(papers, board, distance, tilt):
     found = detect_board(image, board)
     rms, most, count = errors(found.pixels, truth)
     assert count == board.corners
-    # 0.005 px is what noise of 1 % of the contrast leaves; the issue asks for 0.1.
+    # 0.005 px is what noise of 1 % of the contrast leaves.
     assert rms < 0.01
     assert most < 0.03
     miss = found.pixels - truth
