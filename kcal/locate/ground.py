@@ -108,11 +108,11 @@ class Raster:
             lon, lat = map(np.asarray, self.into.transform(lon, lat, direction="INVERSE"))
         return geodetic_to_ecef(torch.from_numpy(np.stack([lat, lon, np.zeros_like(lat)], -1)))
 
-    def farthest(self, place: Tensor) -> float:
-        """Meters from a geocentric place (3,) to the farthest corner; not finite where that cannot be told."""
+    def farthest(self, place: Tensor, most: float = math.inf) -> float:
+        """Meters from a geocentric place (3,) to the farthest corner; at most so many, and where it cannot be told."""
         rows, columns = self.heights.shape
         corners = self.on_earth(np.array([0.0, columns, 0.0, columns]), np.array([0.0, 0.0, rows, rows]))
-        return float(torch.linalg.vector_norm(corners - place, dim=-1).max())
+        return float(torch.linalg.vector_norm(corners - place, dim=-1).max().nan_to_num(most).clamp_max(most))
 
     def between(self, column: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
         """Heights at columns and rows of `cells`, interpolated; NaN outside and beside unknown cells."""
@@ -461,9 +461,9 @@ def _ground_ahead(
     if isinstance(ground, Raster):
         # No farther than the raster reaches.
         away = float(torch.linalg.vector_norm(start, dim=-1).max()) + ground.most
-        away += ground.farthest(frame.ecef_of_origin)
+        away += ground.farthest(frame.ecef_of_origin, _FARTHEST)
         cell = ground.cell_m
-        coarse = torch.arange(0.0, (away if away < _FARTHEST else _FARTHEST) + 2.0 * cell, cell, dtype=torch.float64)
+        coarse = torch.arange(0.0, min(away, _FARTHEST) + 2.0 * cell, cell, dtype=torch.float64)
         search = Search(_subdivided(coarse), functools.partial(heights_over, ground, coarse), _WITHIN)
     reached, there, slope = first_meeting(along, above, len(wanted), search)
     met[wanted] = reached

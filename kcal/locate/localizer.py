@@ -518,7 +518,7 @@ class Localizer(Operations, Movable, StatedModule):
             enu=torch.where(torn[..., None], 0.0, found.enu),
             covariance=torch.where(torn[..., None, None], nowhere, found.covariance),
             geodetic=torch.where(torn[..., None], self.geodetic_of_origin, found.geodetic),
-            status=stereo.flag_positions(found.status, (torn, PositionStatus.CONTRADICTION)),
+            status=stereo.flagged(found.status, (torn, PositionStatus.CONTRADICTION)),
         )
 
     @property

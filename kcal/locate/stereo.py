@@ -84,7 +84,7 @@ def status_counts(status: Tensor) -> str:
     return ", ".join(f"{number} {PositionStatus(code).name}" for code, number in sorted(counts.items())) or "no points"
 
 
-def flag_positions(code: Tensor, *flags: tuple[Tensor, enum.IntEnum]) -> Tensor:
+def flagged(code: Tensor, *flags: tuple[Tensor, enum.IntEnum]) -> Tensor:
     """`code` (whole numbers) with a status where its condition is true; where several are, the last of them."""
     for condition, status in flags:
         code = torch.where(condition, code.new_full((), int(status)), code)
@@ -209,7 +209,7 @@ def sight_lines(rig: Rig, pixels_left: Tensor, pixels_right: Tensor) -> SightLin
     parallel, opposite, along_baseline = _epipolar(rays_left, rays_right @ rotation, -translation @ rotation)
     points, solved = triangulate_pairs(rays_left, rays_right, (rotation, translation))
     code = torch.full(rays_left.shape[:-1], int(PositionStatus.OK), dtype=torch.int8, device=rays_left.device)
-    code = flag_positions(
+    code = flagged(
         code,
         (parallel | along_baseline, PositionStatus.PARALLEL),
         ((opposite | ~(solved | parallel)) & ~along_baseline, PositionStatus.BEHIND),

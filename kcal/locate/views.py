@@ -25,7 +25,7 @@ from kcal.locate.max_likelihood import (
 from kcal.locate.stereo import (
     BEARING_SIGMAS,
     PositionStatus,
-    flag_positions,
+    flagged,
     joint_covariance,
     range_interval,
     sight_lines,
@@ -269,7 +269,7 @@ def fit_views(
         code = torch.full(used.shape[:-1], int(PositionStatus.OK), dtype=torch.int8, device=used.device)
         count = used.sum(-1)
         nothing = count == 0
-        code = flag_positions(
+        code = flagged(
             code,
             (count == 1, PositionStatus.BEARING_ONLY),
             (nothing & ~seen.any(-1), PositionStatus.MASKED),
@@ -293,7 +293,7 @@ def fit_views(
             stated = height(place, ray, anchor, count == 1)
             alone = (count == 1) & stated.reached
             away, met = torch.where(alone[..., None], stated.point - place, away), met | alone
-            code = flag_positions(code, (alone, PositionStatus.OK))
+            code = flagged(code, (alone, PositionStatus.OK))
         away = torch.where(met[..., None], away, ray)
         distance = torch.linalg.vector_norm(away, dim=-1)
         ahead, inverse = away / distance[..., None], torch.where(met, scale / distance, 0.0)
@@ -421,7 +421,7 @@ def fit_pairs(
         lines = sight_lines(rig, left, right)
         weight, sound = inverse_covariances(cov)
         flags = (~sound, PositionStatus.BAD_COVARIANCE), (~finite, PositionStatus.NOT_FINITE)
-        code = flag_positions(lines.status, *flags, *([] if mask is None else [(~mask, PositionStatus.MASKED)]))
+        code = flagged(lines.status, *flags, *([] if mask is None else [(~mask, PositionStatus.MASKED)]))
         met = code == int(PositionStatus.OK)
         usable = met | ((code == int(PositionStatus.PARALLEL)) & ~lines.along_baseline)
         scale = rig.baseline.detach()
@@ -475,7 +475,7 @@ def reach_of(found: ViewsFit, variance: Tensor, behind: Tensor | None = None) ->
         lost = usable & ~(value > 0)
         # What the closed form put at infinity may have come back in front of the rig.
         back = usable & ~lost & ~weak
-        code = flag_positions(
+        code = flagged(
             code,
             (weak & (code == int(PositionStatus.OK)), PositionStatus.BEARING_ONLY),
             *([] if behind is None else [(behind, PositionStatus.BEHIND)]),

@@ -12,7 +12,7 @@ from torch import Tensor
 from kcal.arrow import arrow_table
 from kcal.locate.geodesy import place_enu
 from kcal.locate.localizer import Localizer
-from kcal.locate.stereo import BEARING_SIGMAS, PositionStatus, flag_positions, range_interval, status_counts
+from kcal.locate.stereo import BEARING_SIGMAS, PositionStatus, flagged, range_interval, status_counts
 from kcal.pipeline.imm_filter import Summary
 from kcal.pipeline.measurements import product, rooted, squared
 from kcal.texts import brief, briefly
@@ -107,7 +107,7 @@ def track_states(
     sigma = (variance + (slope[:, None] * spread[:3]).sum(0).square().sum(0)).clamp_min(0.0).sqrt()
     status = torch.zeros_like(inverse_range, dtype=torch.int8)
     weak = inverse_range < BEARING_SIGMAS * sigma
-    status = flag_positions(status, (weak, PositionStatus.BEARING_ONLY), (inverse_range <= 0, PositionStatus.PARALLEL))
+    status = flagged(status, (weak, PositionStatus.BEARING_ONLY), (inverse_range <= 0, PositionStatus.PARALLEL))
     ok = status == int(PositionStatus.OK)
     low, high = range_interval(inverse_range, sigma)
 

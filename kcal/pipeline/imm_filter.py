@@ -43,7 +43,8 @@ class Motion:
             sight and along it.
 
     Raises:
-        InputError: a noise that is negative or not finite, or a memory or a number of times that is not positive.
+        InputError: a noise that is negative or not finite, a memory that is not positive, or anything but two positive
+            numbers of times.
     """
 
     acceleration: float
@@ -52,9 +53,10 @@ class Motion:
     fast: tuple[float, float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
-        finite = math.isfinite(self.turn_rate) and all(0 < times < math.inf for times in self.fast)
-        if not (0 <= self.acceleration < math.inf and finite and self.memory_s > 0):
+        if not (0 <= self.acceleration < math.inf and math.isfinite(self.turn_rate) and self.memory_s > 0):
             raise InputError("motion: a finite noise, not negative, a finite rate and a positive memory are needed")
+        if not (isinstance(self.fast, tuple) and len(self.fast) == 2 and all(0 < n < math.inf for n in self.fast)):
+            raise InputError(f"motion: fast must be two positive numbers, across and along, got {self.fast!r}")
 
 
 # New targets may be aircraft at 150 m/s. How fast they cross shows at once, so that only what turns begins as fast; how

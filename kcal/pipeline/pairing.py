@@ -18,7 +18,7 @@ from kcal.corners.match import MatchStatus
 from kcal.dispatch import still
 from kcal.errors import InputError
 from kcal.lens.rig import Rig
-from kcal.locate.stereo import flag_positions
+from kcal.locate.stereo import flagged
 from kcal.pipeline.association import AssociationOptions, associate
 from kcal.pipeline.detections import Detections
 from kcal.texts import brief, briefly
@@ -500,7 +500,7 @@ class ObjectDisparity(StatedModule):
             searched = (scores > -1.0).flatten(1).any(1)
             textured = patches.is_textured(template, weight)
             # What is named last counts first.
-            status = flag_positions(
+            status = flagged(
                 torch.full_like(score, int(MatchStatus.GOOD), dtype=torch.int64),
                 (rival > options.max_rival * score, MatchStatus.AMBIGUOUS),
                 (edge | (score < options.min_score), MatchStatus.NO_MATCH),
@@ -521,7 +521,7 @@ class ObjectDisparity(StatedModule):
             by_anchor = middle @ torch.linalg.inv_ex(own)[0]
             off_line = (column[:, 1] / planes.step).abs() * 2**level
             sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-            status = flag_positions(
+            status = flagged(
                 status,
                 (found & (off_line > options.max_off_line), MatchStatus.OFF_LINE),
                 (found & ~(sigma < options.max_sigma), MatchStatus.FLAT),

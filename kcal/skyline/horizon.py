@@ -415,8 +415,7 @@ class TerrainRays:
         self.raster, self.eye = raster, eye
         self.radius = mean_radius(eye.lat)
         self.bending = refraction / (2.0 * self.radius)
-        away = raster.farthest(geodetic_to_ecef(eye.geodetic))
-        self.farthest = away if away < _FARTHEST else _FARTHEST
+        self.farthest = raster.farthest(geodetic_to_ecef(eye.geodetic), _FARTHEST)
         self._place = anchor(eye)
         self._nodes = 0.5 * self.farthest * (1.0 - np.cos(math.pi * (np.arange(_NODES) + 0.5) / _NODES))
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from kcal import Camera, InputError, Localizer, Rig
 from kcal.corners import MatchStatus, patches
 from kcal.lens import rotation_from_vector
-from kcal.locate.stereo import flag_positions
+from kcal.locate.stereo import flagged
 from kcal.pipeline.pairing import DisparityOptions, ObjectDisparities, ObjectDisparity, _brightest, _Objects
 from scripts.shared.marking_scene import background, exposed, paint_plate, plate, texture_gradient, true_box
 
@@ -369,8 +369,8 @@ def test_patches_have_at_most_24_steps_to_each_side(scene: Case, monkeypatch: py
 def test_what_is_named_last_counts() -> None:
     start = torch.zeros(3, dtype=torch.int64)
     yes, no = torch.tensor([True, True, False]), torch.tensor([False, True, False])
-    flagged = flag_positions(start, (yes, MatchStatus.FLAT), (no, MatchStatus.NO_RAY))
-    assert flagged.tolist() == [MatchStatus.FLAT, MatchStatus.NO_RAY, 0]
+    status = flagged(start, (yes, MatchStatus.FLAT), (no, MatchStatus.NO_RAY))
+    assert status.tolist() == [MatchStatus.FLAT, MatchStatus.NO_RAY, 0]
 
 
 def test_the_brightest_gray_level_is_that_of_the_type() -> None:

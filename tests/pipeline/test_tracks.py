@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import math
+from typing import Any
 
 import pandas
 import polars
@@ -313,6 +314,12 @@ def test_time_must_be_given_and_must_not_go_back() -> None:
 def test_impossible_options(wrong: dict[str, object]) -> None:
     with pytest.raises(InputError):
         TrackOptions(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("fast", [(0.0, 1.0), (1.0, math.nan), (1.0,), 7.0])
+def test_impossible_speeds_of_a_motion(fast: Any) -> None:
+    with pytest.raises(InputError, match="fast must be two positive numbers, across and along"):
+        Motion(acceleration=1.0, fast=fast)
 
 
 def test_tracks_are_tables() -> None:
